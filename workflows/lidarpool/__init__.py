@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .clouds.writing import save_cloud
     from .comparing.comparison import Comparison
     from .comparing.fit import Fit, fit
+    from .comparing.surveys import SurveyComparison, compare_strips, compare_surveys
     from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
     from .pages.scanner_page import show
@@ -101,6 +102,7 @@ __all__ = [
     "Sensor",
     "Spin",
     "Survey",
+    "SurveyComparison",
     "Sweep",
     "Track",
     "Twin",
@@ -108,6 +110,8 @@ __all__ = [
     "augment",
     "box",
     "compare",
+    "compare_strips",
+    "compare_surveys",
     "fit",
     "fit_pattern",
     "load_robot",
@@ -146,6 +150,7 @@ _MODULES = {
     ".playback.live": ("play",),
     ".report.merging": ("merge",),
     ".comparing.comparison": ("Comparison",),
+    ".comparing.surveys": ("SurveyComparison", "compare_strips", "compare_surveys"),
     ".comparing.two_clouds": ("compare",),
     ".comparing.fit": ("Fit", "fit"),
     ".scan_patterns": ("PatternFit", "fit_pattern"),

@@ -36,12 +36,13 @@ from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
 from .augment_command import augment
+from .compare_command import compare
 from .first_step import print_first_step
 from .flight_command import flight
 from .follow_command import follow
 from .mount_command import mount
 from .play_command import play
-from .result_commands import compare, export, fit, plot, view
+from .result_commands import export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
 from .serve_command import serve
 from .stations_command import stations

@@ -1,4 +1,4 @@
-"""Implementation of the commands `plot`, `export`, `view`, `compare` and `fit`."""
+"""Implementation of the commands `plot`, `export`, `view` and `fit`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.errors import LidarError
-from lidarsim.schema.vocabulary import PICTURES, UNITS_M
+from lidarsim.schema.vocabulary import PICTURES
 
 from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
 from . import completion
@@ -337,99 +337,6 @@ def view(
                 growing = growing_view(folders[0], keep_noise=keep_noise)
             shown = growing or open_views(folders, **reading)
             show_view(shown, port=port, browser=not no_browser)
-
-
-@click.command()
-@click.argument("a", metavar="A", type=click.Path(path_type=Path))
-@click.argument("b", metavar="B", type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("lidarpool-compare"),
-    show_default=True,
-    help="Output folder for compare.html, compare.json and pictures; existing files are replaced.",
-)
-@click.option(
-    "--sweep",
-    "sweeps",
-    type=int,
-    multiple=True,
-    help="Index of a pair of sweeps to compare, starting at 0; can be repeated (default: all).",
-)
-@click.option(
-    "--match",
-    type=click.Choice(["order", "time"]),
-    default="order",
-    show_default=True,
-    help="How to pair the sweeps of A and B.",
-)
-@click.option("--sensor-a", metavar="NAME", help="Sensor or topic of A, if A contains several.")
-@click.option("--sensor-b", metavar="NAME", help="Sensor or topic of B, if B contains several.")
-@click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
-@click.option("--intensity-b", metavar="COLUMN", help="Column of B to compare as intensity.")
-@click.option(
-    "--unit-a",
-    type=click.Choice([*UNITS_M]),
-    help="Length unit of A (default: from a .las or .laz file, otherwise m).",
-)
-@click.option(
-    "--unit-b",
-    type=click.Choice([*UNITS_M]),
-    help="Length unit of B (default: from a .las or .laz file, otherwise m).",
-)
-@options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
-@click.option(
-    "--azimuth-deg",
-    type=float,
-    help="Cell width of the range images in degrees (default: the azimuth step of the sensor).",
-)
-@click.option(
-    "--distance",
-    "distances_m",
-    type=float,
-    metavar="M",
-    multiple=True,
-    default=(0.05, 0.1, 0.2, 0.5),
-    show_default=True,
-    help="Distance threshold in meters for the F-score; can be repeated.",
-)
-@click.option(
-    "--max-points",
-    type=int,
-    default=10_000_000,
-    show_default=True,
-    help="Maximum number of points to load from a cloud without sweeps.",
-)
-@click.option(
-    "--protocol",
-    type=click.Choice(["lidar4d"]),
-    help="Published evaluation protocol whose metrics are also computed.",
-)
-@options.as_json
-def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
-    """Compare two point clouds or recordings of the same scene.
-
-    B is the reference. A and B can be results, data sets, .ply or .pcd files or folders of these,
-    .las, .laz, .e57, .pts, .ptx, .npy, .bin, .pcap, .osf or text files such as .csv, or ROS 2 bags.
-    Sweeps of the same sensor are compared as range images, and clouds without rings by point
-    distances.
-
-    \b
-    Examples:
-      lidarpool compare noisy clean
-      lidarpool compare result recording.mcap --sensor-b /lidar/points --out compared
-      lidarpool compare scan.laz earlier.laz --distance 0.05
-      lidarpool compare scan.laz model.ply --unit-b ft
-      lidarpool compare simulated recorded --protocol lidar4d
-    """  # noqa: D301 - Click requires the character \b
-    from ..comparing.two_clouds import compare as compared
-    from ..processes.fork_server import keep_freed_memory
-
-    keep_freed_memory()
-    comparison = compared(a, b, **settings)
-    page = next(path for path in comparison.save(out) if path.suffix == ".html")
-    lines = [repr(comparison), f"page     {click.format_filename(page)}"]
-    options.print_results(comparison.figures, lines, as_json)
 
 
 @click.command()

@@ -571,6 +571,7 @@ def open_cloud(
         parts = -(-len(cloud) // CHUNK_POINTS)
         return Recording(name, parts, read_part, is_cloud=True, point_count=len(cloud), **fields)
     saved = load_sweeps()
+    fields["epsg"] = saved.epsg
     sensor_index = saved.sensors.index(choose(name, "sensors", saved.sensors, sensor))
     indices = np.flatnonzero(saved.sensor == sensor_index).tolist()
 

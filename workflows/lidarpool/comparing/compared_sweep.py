@@ -23,7 +23,7 @@ def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False
     Raises LidarError if the recording cannot be read.
     """
     sweep = with_compared_columns(recording[number], with_rays=with_rays).returns()
-    _check_reach(recording, sweep)
+    check_reach(recording, sweep)
     return sweep
 
 
@@ -36,7 +36,7 @@ def compared_in_world(recording: Recording, number: int) -> Sweep:
     """
     sweep = with_compared_columns(recording[number])
     sweep = sweep.with_columns(intensity=sweep.intensity).returns()
-    _check_reach(recording, sweep)
+    check_reach(recording, sweep)
     if recording.is_cloud:
         return sweep
     if sweep.pose is None:
@@ -47,7 +47,7 @@ def compared_in_world(recording: Recording, number: int) -> Sweep:
     return sweep.replace(points=sweep.in_world())
 
 
-def _check_reach(recording: Recording, sweep: Sweep) -> None:
+def check_reach(recording: Recording, sweep: Sweep) -> None:
     """Raise LidarError if a coordinate is implausibly large."""
     if (reach := float(np.abs(sweep.points).max(initial=0.0))) > MAX_COORDINATE_M:
         raise LidarError(

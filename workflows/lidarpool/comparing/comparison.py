@@ -24,7 +24,8 @@ from ..report.page.rendering import millimeters, render_template
 from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
-_PICTURES = ("ranges", "rings", "distances", "above")
+# Pictures of all comparisons, including those of surveys.
+PICTURES = ("ranges", "rings", "distances", "above", "map", "histogram")
 # States of a cell. The first three name the clouds in which the cell has no return.
 CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
 
@@ -92,7 +93,7 @@ class Comparison:
             files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
             for name, content in files.items():
                 (staged / name).write_bytes(content)
-            for name in _PICTURES:
+            for name in PICTURES:
                 if name not in pages:
                     (path / f"compare-{name}.png").unlink(missing_ok=True)
             return [(staged / name).replace(path / name) for name in files]

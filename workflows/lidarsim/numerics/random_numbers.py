@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import Floats
 
 _GAMMA = 0x9E3779B97F4A7C15
+_ONE = np.uint64(1)
 _NUMBERS = 256  # maximum number of random numbers per ray and purpose
 
 
@@ -67,6 +68,18 @@ def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
         x *= np.uint64(factor)
     x ^= x >> np.uint64(31)
     return x
+
+
+def hash_rows(*columns: NDArray[np.integer]) -> NDArray[np.uint64]:
+    """Return a 64-bit hash of each row of integer columns.
+
+    The columns have shape (n,), and so has the result. Two different rows have the same hash with a
+    probability of 2**-64.
+    """
+    state = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        state = _mixed(state * np.uint64(_GAMMA) + column.astype(np.int64).view(np.uint64) + _ONE)
+    return state
 
 
 def named_seed(seed: int, name: str) -> int:

@@ -1,0 +1,366 @@
+"""Surveys compared in world coordinates: closed forms, pairing, signs, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from importlib.util import find_spec
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner
+from rasterio.crs import CRS
+
+from lidarpool import Cloud, LidarError, compare_strips, compare_surveys
+from lidarpool.cli.commands import cli
+from lidarpool.comparing.surveys import pairs
+
+ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])
+SHIFT = (0.03, -0.02, 0.05)
+
+
+def plane(count=4000, *, side=20.0, seed=1, tilt_deg=0.0, height=0.0, noise=0.0):
+    """Points of a plane that rises to the east, in a projected coordinate system."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, side, (2, count))
+    z = height + x * np.tan(np.radians(tilt_deg)) + rng.normal(0, noise, count)
+    return np.column_stack([x, y, z]) + ORIGIN
+
+
+def cloud(points, **columns):
+    return Cloud(points, columns)
+
+
+def components(found, *names):
+    values = [found.figures["components"][name] for name in names]
+    return values[0] if len(values) == 1 else values
+
+
+# -- pairs ----------------------------------------------------------------------------------------
+
+
+def test_a_shift_is_found_whatever_the_order_and_the_lost_points():
+    points = plane()
+    time = np.arange(len(points)) * 1000
+    ranges = np.full(len(points), 50.0)
+    rows = np.random.default_rng(2).permutation(len(points))[:3000]
+    a = cloud(points[rows] + SHIFT, time=time[rows], range=ranges[rows] + 0.007)
+    b = cloud(points[5:], time=time[5:], range=ranges[5:])
+    found = compare_surveys(a, b)
+    count = np.count_nonzero(rows >= 5)
+    assert found.figures["method"] == "pairs"
+    assert found.figures["unpaired"] == {"a": 3000 - count, "b": len(points) - 5 - count}
+    expected = dict(zip(("delta_e", "delta_n", "delta_h"), SHIFT, strict=True))
+    for name, value in {**expected, "range": 0.007, "horizontal": np.hypot(*SHIFT[:2])}.items():
+        one = components(found, name)
+        assert one["count"] == count
+        assert one["mean_m"] == pytest.approx(value, abs=1e-6)
+        assert one["rmse_m"] == pytest.approx(abs(value), abs=1e-6)
+        assert one["p95_abs_m"] == pytest.approx(abs(value), abs=1e-6)
+        assert one["std_m"] < 1e-8
+
+
+def test_noise_is_found_with_its_spread_and_its_95_percent():
+    points = plane(20_000)
+    time = np.arange(len(points))
+    noisy = points + np.random.default_rng(3).normal(0, (0.01, 0.02, 0.03), points.shape)
+    found = compare_surveys(cloud(noisy, time=time), cloud(points, time=time))
+    for name, sigma in (("delta_e", 0.01), ("delta_n", 0.02), ("delta_h", 0.03)):
+        one = components(found, name)
+        assert one["std_m"] == pytest.approx(sigma, rel=4 / np.sqrt(2 * len(points)))
+        assert one["p95_abs_m"] == pytest.approx(1.96 * sigma, rel=0.04)
+
+
+def test_returns_of_a_pulse_are_paired_by_their_number():
+    points = plane(400)
+    time = np.repeat(np.arange(200), 2)
+    number = np.tile([1, 2], 200).astype(np.uint8)
+    kept = np.random.default_rng(4).permutation(400)[:300]
+    a = cloud(points[kept] + SHIFT, time=time[kept], return_number=number[kept])
+    found = compare_surveys(a, cloud(points, time=time, return_number=number))
+    assert components(found, "delta_h")["count"] == 300
+    assert components(found, "delta_h")["std_m"] < 1e-8
+    without = compare_surveys(cloud(points[:-1], time=time[:-1]), cloud(points, time=time))
+    assert without.figures["method"] == "planes", "all times but one are ambiguous"
+
+
+def test_a_sample_keeps_both_points_of_a_pair():
+    points = plane(8000)
+    time = np.arange(len(points))
+    order = np.random.default_rng(5).permutation(len(points))
+    a = cloud(points[order] + SHIFT, time=time[order])
+    found = compare_surveys(a, cloud(points, time=time), max_points=1000)
+    one = components(found, "delta_n")
+    assert 300 < one["count"] <= 1000
+    assert one["mean_m"] == pytest.approx(SHIFT[1], abs=1e-8) and one["std_m"] < 1e-8
+    assert found.figures["unpaired"] == {"a": 0, "b": 0}
+    assert any("% of the rays are compared" in note for note in found.figures["notes"])
+
+
+def test_clouds_without_common_times_are_not_paired():
+    points = plane(1000)
+    a, b = cloud(points, time=np.arange(1000)), cloud(points, time=np.arange(1000) + 5000)
+    assert compare_surveys(a, b).figures["method"] == "planes"
+    with pytest.raises(LidarError, match="hardly any points with the same time"):
+        compare_surveys(a, b, method="pairs")
+    with pytest.raises(LidarError, match="no column `time` or `gps_time` in common"):
+        compare_surveys(cloud(points), b, method="pairs")
+
+
+def test_rows_of_floating_point_times_have_the_same_key_if_they_are_equal_to_a_tenth_microsecond():
+    key = pairs.PairKey(("gps_time",), has_ranges=False)
+    from lidarsim.columns.sweep import Sweep
+
+    times = 3.2e8 + np.arange(5) * 1e-6
+    first, second = (
+        key.of(Sweep(np.zeros((5, 3)), {"gps_time": times + shift})).keys for shift in (0, 2e-8)
+    )
+    assert len(set(first.tolist())) == 5
+    assert np.array_equal(first, second)
+
+
+# -- planes and M3C2 ------------------------------------------------------------------------------
+
+
+def test_a_tilted_plane_has_the_distances_of_its_angle():
+    tilt_deg = 1.5
+    tilted = plane(tilt_deg=tilt_deg, seed=6)
+    found = compare_surveys(cloud(tilted), cloud(plane()), method="planes", max_distance_m=5)
+    heights = (tilted[:, 0] - ORIGIN[0]) * np.tan(np.radians(tilt_deg))
+    one = components(found, "distance")
+    assert one["count"] > 0.99 * len(tilted)
+    assert one["mean_m"] == pytest.approx(heights.mean(), rel=0.01)
+    assert one["max_m"] == pytest.approx(heights.max(), rel=0.01)
+    below = compare_surveys(cloud(plane()), cloud(tilted), method="planes", max_distance_m=5)
+    expected = -np.sin(np.radians(tilt_deg)) * (plane()[:, 0] - ORIGIN[0]).mean()
+    assert components(below, "distance")["mean_m"] == pytest.approx(expected, rel=0.01)
+
+
+def test_points_of_a_wall_are_in_front_to_the_east():
+    rng = np.random.default_rng(7)
+    wall = np.column_stack([np.zeros(2000), rng.uniform(0, 10, (2000, 2))])
+    found = compare_surveys(cloud(wall + np.array([0.04, 0, 0])), cloud(wall), method="planes")
+    assert components(found, "distance")["mean_m"] == pytest.approx(0.04, abs=1e-6)
+
+
+def test_points_without_a_counterpart_are_counted():
+    far = np.concatenate([plane(500), plane(100) + np.array([0, 0, 5])])
+    found = compare_surveys(cloud(far), cloud(plane()), method="planes", max_distance_m=2)
+    assert found.figures["without_counterpart"] == 100
+    assert components(found, "distance")["count"] + found.figures["without_plane"] == 500
+
+
+@pytest.mark.extended
+@pytest.mark.skipif(find_spec("py4dgeo") is None, reason="py4dgeo is not installed")
+def test_m3c2_finds_a_shift_and_what_is_above_the_level_of_detection():
+    noise = 0.01
+    a, b = plane(seed=8, height=0.04, noise=noise), plane(noise=noise)
+    found = compare_surveys(cloud(a), cloud(b), method="m3c2", radius_m=0.8)
+    one = components(found, "distance")
+    level = found.figures["level_of_detection"]
+    assert one["mean_m"] == pytest.approx(0.04, abs=0.001)
+    # Lague et al. 2013: 1.96 sqrt(s1² / n1 + s2² / n2), with the points of a cylinder.
+    per_cylinder = 10 * np.pi * 0.8**2
+    expected = 1.96 * np.sqrt(2 * noise**2 / per_cylinder)
+    assert level["median_m"] == pytest.approx(expected, rel=0.1)
+    assert one["count"] - 2 < level["core_points"] <= one["count"]
+    assert level["significant"] >= level["core_points"] - 2
+    same = compare_surveys(cloud(plane(seed=9, noise=noise)), cloud(b), method="m3c2", radius_m=0.8)
+    level = same.figures["level_of_detection"]
+    assert level["significant"] < 0.12 * level["core_points"]
+
+
+# -- meshes ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    file = tmp_path_factory.mktemp("ball") / "ball.ply"
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=5.0)
+    mesh.apply_translation((10, 20, 30))
+    mesh.export(file)
+    return file
+
+
+@pytest.mark.parametrize("offset", [0.2, -0.2])
+def test_points_outside_a_sphere_are_positive_and_points_inside_negative(ball, offset):
+    directions = np.random.default_rng(10).normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    found = compare_surveys(cloud(directions * (5 + offset) + (10, 20, 30)), ball)
+    one = components(found, "distance")
+    assert found.figures["method"] == "mesh" and found.figures["is_closed"]
+    # The triangles are up to 5 (1 - cos 2.4°) = 4 mm inside the sphere.
+    assert offset <= one["mean_m"] <= offset + 0.005
+    assert np.sign(one["min_m"]) == np.sign(one["max_m"]) == np.sign(offset)
+
+
+def test_an_open_mesh_is_positive_in_front_of_its_triangles(tmp_path):
+    corners = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0]], float)
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / "ground.stl")
+    points = plane(500, height=0.03) - ORIGIN
+    found = compare_surveys(cloud(points), tmp_path / "ground.stl", method="mesh")
+    assert components(found, "distance")["mean_m"] == pytest.approx(0.03, abs=1e-9)
+    assert any("is not closed" in note for note in found.figures["notes"])
+    in_mm = compare_surveys(cloud(points / 1000), tmp_path / "ground.stl", unit_b="mm")
+    assert components(in_mm, "distance")["mean_m"] == pytest.approx(0.03e-3, abs=1e-9)
+
+
+# -- strips ---------------------------------------------------------------------------------------
+
+
+def test_strips_have_the_height_difference_between_them():
+    first, second = plane(8000, tilt_deg=8), plane(8000, seed=11, tilt_deg=8, height=-0.07)
+    found = compare_strips(cloud(first), cloud(second[second[:, 1] > ORIGIN[1] + 10]), cell_m=2.0)
+    (overlap,) = found.figures["overlaps"]
+    assert (overlap["a"], overlap["b"]) == ("cloud 1", "cloud 2")
+    assert overlap["count"] == 50 and overlap["area_m2"] == 200
+    for name in ("mean_m", "median_m", "rmse_m", "p95_abs_m"):
+        assert overlap[name] == pytest.approx(0.07, abs=1e-6)
+
+
+def test_strips_of_a_file_are_its_point_sources_and_rough_cells_are_omitted(tmp_path):
+    rng = np.random.default_rng(12)
+    ground = [plane(3000, seed=seed, height=h) for seed, h in ((13, 0.0), (14, 0.05), (15, -0.02))]
+    tree = plane(500, side=4.0, seed=16) + np.column_stack(
+        [*np.zeros((2, 500)), 9 * rng.random(500)]
+    )
+    points = np.concatenate([*ground, tree])
+    sources = np.repeat([3, 7, 9, 7], [3000, 3000, 3000, 500])
+    found = compare_strips(write_las(tmp_path / "flight.laz", points, sources), cell_m=2.0)
+    expected = {("3", "7"): -0.05, ("3", "9"): 0.02, ("7", "9"): 0.07}
+    for overlap in found.figures["overlaps"]:
+        difference = expected.pop((overlap["a"], overlap["b"]))
+        assert overlap["median_m"] == pytest.approx(difference, abs=0.001)
+        assert overlap["count"] == (96 if "7" in (overlap["a"], overlap["b"]) else 100)
+    assert not expected and found.figures["rough_cells"] == 8
+
+
+def test_returns_of_split_pulses_are_not_used_for_strips():
+    first = plane(3000)
+    branches = plane(3000, seed=17, height=0.09)
+    both = np.concatenate([plane(3000, seed=18, height=0.02), branches])
+    returns = np.repeat([1, 2], 3000).astype(np.uint8)
+    found = compare_strips(cloud(both, returns=returns), cloud(first), cell_m=2.0)
+    assert found.figures["single_returns"] == 6000
+    assert found.figures["overlaps"][0]["mean_m"] == pytest.approx(0.02, abs=1e-6)
+
+
+def test_one_strip_and_strips_apart_are_refused():
+    with pytest.raises(LidarError, match="contains 1 strip, and at least two are required"):
+        compare_strips(cloud(plane(500)))
+    with pytest.raises(LidarError, match="No two of the 2 strips have comparable cells"):
+        compare_strips(cloud(plane(500)), cloud(plane(500) + np.array([100, 0, 0])))
+
+
+# -- what is refused, and files -------------------------------------------------------------------
+
+
+def write_las(path, points, sources=None, epsg=None):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, 1e-4), np.floor(points.mean(axis=0))
+    if epsg is not None:
+        wkt = CRS.from_epsg(epsg).to_wkt()
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        header.global_encoding.wkt = True
+    data = laspy.LasData(header)
+    data.x, data.y, data.z = points.T
+    data.gps_time = np.arange(len(points)) * 1e-5
+    data.return_number = data.number_of_returns = np.ones(len(points), np.uint8)
+    if sources is not None:
+        data.point_source_id = sources
+    data.write(path)
+    return path
+
+
+def test_different_coordinate_systems_are_refused(tmp_path):
+    points = plane(300)
+    a = write_las(tmp_path / "a.las", points, epsg=25832)
+    b = write_las(tmp_path / "b.las", points, epsg=25833)
+    with pytest.raises(
+        LidarError, match=r"a.las has the coordinate system EPSG:25832, but .*b.las"
+    ):
+        compare_surveys(a, b)
+    with pytest.raises(LidarError, match="EPSG:25833"):
+        compare_strips(a, b)
+    none = write_las(tmp_path / "none.las", points)
+    found = compare_surveys(none, a)
+    assert found.figures["coordinate_system"] == "EPSG:25832"
+    assert any("is assumed to be in EPSG:25832" in note for note in found.figures["notes"])
+
+
+def test_different_units_are_refused(tmp_path):
+    points = plane(300)
+    np.savetxt(tmp_path / "feet.xyz", points)
+    meters = tmp_path / "meters.xyz"
+    np.savetxt(meters, points * 0.3048)
+    found = compare_surveys(tmp_path / "feet.xyz", meters, unit_a="ft", method="planes", radius_m=2)
+    assert abs(components(found, "distance")["mean_m"]) < 1e-6
+    from lidarpool.comparing.surveys.survey_clouds import SurveyCloud, check_same_frame
+
+    feet = SurveyCloud.open(tmp_path / "feet.xyz", "", unit="ft")
+    feet = SurveyCloud(feet.name, feet.recordings, None)  # as if the file stated its unit
+    with pytest.raises(LidarError, match=r"feet.xyz has the unit ft, but .*meters.xyz has m"):
+        check_same_frame([feet, SurveyCloud.open(meters, "")])
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"method": "nearest"}, "method"),
+        ({"method": "pairs", "radius_m": 1}, "`radius` does not apply to the method pairs"),
+        ({"method": "mesh"}, "is not a mesh"),
+        ({"method": "planes", "radius_m": 0}, "radius_m"),
+        ({"method": "planes", "up_axis": "y"}, "`up-axis` does not apply"),
+    ],
+)
+def test_wrong_options_are_refused(options, says):
+    a = cloud(plane(200), time=np.arange(200))
+    with pytest.raises(LidarError, match=says):
+        compare_surveys(a, a, **options)
+
+
+def test_clouds_that_are_apart_are_refused():
+    with pytest.raises(LidarError, match=r"are 80\.\d+ m apart, so there is nothing to compare"):
+        compare_surveys(cloud(plane(300)), cloud(plane(300) + np.array([100, 0, 0])))
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(cli, ["compare", *map(str, arguments)])
+
+
+def test_the_command_writes_a_table_maps_and_a_page(tmp_path):
+    points = plane(900)
+    a = write_las(tmp_path / "a.laz", points + SHIFT)
+    b = write_las(tmp_path / "b.laz", points)
+    done = invoke(a, b, "--survey", "pairs", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert "Δh               900      50.0" in done.output
+    rows = [*csv.DictReader((tmp_path / "out" / "compare.csv").read_text().splitlines())]
+    assert [row["component"] for row in rows] == ["delta_e", "delta_n", "delta_h", "horizontal"]
+    assert float(rows[2]["rmse_m"]) == pytest.approx(0.05, abs=1e-4)
+    figures = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert figures["paired_by"] == "gps time, return number"
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert page.count("<svg") == 2 and "ΔE" in page and "95th percentile" in page
+    for name in ("map", "histogram"):
+        assert (tmp_path / "out" / f"compare-{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["a"], "Missing argument 'B'"),
+        (["a", "b", "c"], "More than two clouds require `--survey strips`"),
+        (["a", "b", "--cell", "2"], "`--cell` requires `--survey`"),
+        (["a", "b", "--cell", "2", "--radius", "1"], "`--radius` and `--cell` require `--survey`"),
+        (["a", "b", "--survey", "pairs", "--cell", "2"], "`--cell` requires `--survey strips`"),
+        (["a", "b", "--survey", "auto", "--sweep", "0"], "`--sweep` cannot be used"),
+        (["a", "--survey", "strips", "--unit-a", "ft"], "`--unit-a` cannot be used"),
+    ],
+)
+def test_options_of_another_kind_of_comparison_are_refused(arguments, says):
+    done = invoke(*arguments)
+    assert done.exit_code == 2
+    assert says in " ".join(done.output.split())

@@ -1,0 +1,80 @@
+"""Distances by M3C2 (Lague et al. 2013), computed by py4dgeo."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from lidarsim.environment.extras import require_package
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
+
+from .deviations import Deviations
+
+_MAX_CORE_POINTS = 500_000
+
+
+def m3c2_deviations(
+    points: Floats, reference: Floats, radius_m: float, max_distance_m: float
+) -> Deviations:
+    """Return M3C2 distances of A from B at core points, with their level of detection.
+
+    There is one core point in each cubic cell of `radius_m` that contains points of B. Normals are
+    computed from the points of B within `radius_m`, and point up. Points of A and B within a
+    cylinder of this radius, up to `max_distance_m` along the normal in both directions, are
+    averaged.
+
+    Parameters
+    ----------
+    points, reference
+        Points of A and B in world coordinates. Shapes (n, 3) and (m, 3).
+    radius_m
+        Radius of the neighborhoods and of the cylinders.
+    max_distance_m
+        Half of the length of the cylinders.
+    """
+    require_package("py4dgeo", "m3c2", "`--survey m3c2`")
+    import py4dgeo
+
+    logging.getLogger("py4dgeo").setLevel(logging.WARNING)
+    origin = np.floor(reference.mean(axis=0))
+    cells = np.floor((reference - origin) / radius_m).astype(np.int64)
+    _, rows = np.unique(cells, axis=0, return_index=True)
+    if len(rows) > _MAX_CORE_POINTS:
+        raise LidarError(
+            f"A radius of {radius_m:g} m results in {len(rows):,} core points; the limit is "
+            f"{_MAX_CORE_POINTS:,}. Increase `--radius`."
+        )
+    core_points = np.ascontiguousarray(reference[np.sort(rows)] - origin)
+    epochs = tuple(
+        py4dgeo.Epoch(np.ascontiguousarray(cloud - origin)) for cloud in (reference, points)
+    )
+    algorithm = py4dgeo.M3C2(
+        epochs=epochs,
+        corepoints=core_points,
+        normal_radii=[radius_m],
+        cyl_radius=radius_m,
+        max_distance=max_distance_m,
+    )
+    distances, uncertainties = algorithm.run()
+    detection = np.asarray(uncertainties["lodetection"], np.float64)
+    found = np.isfinite(distances)
+    if not found.any():
+        raise LidarError(
+            f"No core point has points of both clouds within a radius of {radius_m:g} m and a "
+            f"distance of {max_distance_m:g} m. Increase `--radius` or `--max-distance`."
+        )
+    has_level = found & np.isfinite(detection)
+    significant = has_level & (np.abs(distances) > detection)
+    figures = {
+        "radius_m": radius_m,
+        "max_distance_m": max_distance_m,
+        "without_counterpart": int(np.count_nonzero(~found)),
+        "level_of_detection": {
+            "core_points": int(np.count_nonzero(has_level)),
+            "median_m": float(np.median(detection[has_level])) if has_level.any() else None,
+            "significant": int(np.count_nonzero(significant)),
+        },
+    }
+    return Deviations(core_points[found] + origin, {"distance": distances[found]}, figures)

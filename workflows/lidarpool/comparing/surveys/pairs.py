@@ -1,0 +1,200 @@
+"""Deviations of points that belong to the same ray and the same return in both clouds.
+
+Points are paired by a hash of their time or ray, so their order does not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.sweep import Columns, Sweep
+from lidarsim.numerics.arrays import AnyArray, Floats, Indices, Ints
+from lidarsim.numerics.random_numbers import hash_rows
+from lidarsim.words import plural
+
+from .deviations import Deviations
+from .survey_clouds import SENSOR, SurveyCloud
+
+_TIMES = ("time", "gps_time")  # of results, and of LAS files
+_TIME_STEP_S = 1e-7  # resolution of times in floating point numbers
+_MIN_SHARE = 0.01  # minimum share of the smaller cloud that must have a pair
+_BITS = 2**64
+
+
+class _KeyedPoints(NamedTuple):
+    keys: AnyArray  # (n,), uint64
+    points: Floats  # (n, 3)
+    ranges: Floats | None  # (n,)
+
+    def select(self, rows: Indices) -> _KeyedPoints:
+        ranges = None if self.ranges is None else self.ranges[rows]
+        return _KeyedPoints(self.keys[rows], self.points[rows], ranges)
+
+
+@dataclass(frozen=True)
+class PairKey:
+    """Columns that identify a point in both clouds."""
+
+    names: tuple[str, ...]
+    has_ranges: bool  # whether both clouds have ranges
+
+    @classmethod
+    def shared_by(cls, a: Columns, b: Columns) -> PairKey | None:
+        """Return the columns by which points can be paired, or None if there are none."""
+        shared = {*a} & {*b}
+        time = next((name for name in _TIMES if name in shared), None)
+        if time is not None:
+            names = [time, "channel", "return_number"]
+        elif {"scan", "ray"} <= shared:
+            names = ["scan", "ray", "return_number"]
+        else:
+            return None
+        names = [SENSOR, *(name for name in names if name in shared)]
+        return cls(tuple(names), "range" in shared)
+
+    def of(self, part: Sweep) -> _KeyedPoints:
+        """Return the points of a part with their keys. Points without a time are omitted."""
+        columns = [np.asarray(part.columns[name]) for name in self.names]
+        finite = np.logical_and.reduce([np.isfinite(column) for column in columns])
+        keys = hash_rows(*(_as_integers(column[finite]) for column in columns))
+        ranges = np.asarray(part.columns["range"], np.float64)[finite] if self.has_ranges else None
+        return _KeyedPoints(keys, part.points[finite], ranges)
+
+    @property
+    def title(self) -> str:
+        """Names of the columns, as shown in the report."""
+        return ", ".join(name.replace("_", " ") for name in self.names if name != SENSOR)
+
+
+def _as_integers(values: AnyArray) -> Ints:
+    if np.issubdtype(values.dtype, np.floating):
+        return np.rint(values / _TIME_STEP_S).astype(np.int64)
+    return values.astype(np.int64)
+
+
+def find_key(a: SurveyCloud, b: SurveyCloud) -> PairKey | None:
+    """Return the columns by which points of two clouds can be paired, or None if there are none."""
+    first, second = next(a.parts(), None), next(b.parts(), None)
+    if first is None or second is None:
+        return None
+    return PairKey.shared_by(first.columns, second.columns)
+
+
+def pair_deviations(
+    a: SurveyCloud, b: SurveyCloud, key: PairKey, max_points: int
+) -> Deviations | None:
+    """Return A - B for all pairs of points, or None if hardly any points have a pair.
+
+    At most about `max_points` points of each cloud are kept in memory. They are selected by their
+    keys, so that both points of a pair are kept or omitted.
+    """
+    sampled = [_Sampled.read(cloud, key, max_points) for cloud in (a, b)]
+    limit = min(one.limit for one in sampled)
+    matching = _Matching.find(*(_below(one.kept, limit) for one in sampled))
+    if not matching.is_sufficient:
+        return None
+    figures = {
+        "paired_by": key.title,
+        "points": dict(zip("ab", (one.point_count for one in sampled), strict=True)),
+        "unpaired": dict(zip("ab", matching.unpaired, strict=True)),
+        "ambiguous": dict(zip("ab", matching.ambiguous, strict=True)),
+    }
+    notes = [
+        f"{plural(count, 'point')} of {cloud.name} have the same {key.title} as another point and "
+        "are not compared"
+        for cloud, count in zip((a, b), matching.ambiguous, strict=True)
+        if count
+    ]
+    if limit < _BITS:
+        notes.append(f"{100 * limit / _BITS:.3g} % of the rays are compared, selected at random")
+    if not key.has_ranges:
+        notes.append(
+            "ranges are not compared, because they require sweeps or the column `range` in both "
+            "clouds"
+        )
+    return Deviations(matching.b.points, matching.components(), figures, tuple(notes))
+
+
+class _Matching(NamedTuple):
+    """Pairs of points with the same key."""
+
+    a: _KeyedPoints
+    b: _KeyedPoints
+    unpaired: tuple[int, int]  # numbers of points without a counterpart
+    ambiguous: tuple[int, int]  # numbers of points whose key occurs repeatedly
+
+    @classmethod
+    def find(cls, a: _KeyedPoints, b: _KeyedPoints) -> _Matching:
+        (keys_a, rows_a), (keys_b, rows_b) = _unique_keys(a.keys), _unique_keys(b.keys)
+        _, in_a, in_b = np.intersect1d(keys_a, keys_b, assume_unique=True, return_indices=True)
+        return cls(
+            a.select(rows_a[in_a]),
+            b.select(rows_b[in_b]),
+            (len(keys_a) - len(in_a), len(keys_b) - len(in_b)),
+            (len(a.keys) - len(keys_a), len(b.keys) - len(keys_b)),
+        )
+
+    @property
+    def is_sufficient(self) -> bool:
+        """Whether a considerable part of the smaller cloud has a pair."""
+        count = len(self.a.keys)
+        sizes = (count + sum(of) for of in zip(self.unpaired, self.ambiguous, strict=True))
+        return count > 0 and count >= _MIN_SHARE * min(sizes)
+
+    def components(self) -> dict[str, Floats]:
+        """Return A - B of each pair."""
+        delta = self.a.points - self.b.points
+        components = dict(zip(("delta_e", "delta_n", "delta_h"), delta.T, strict=True))
+        components["horizontal"] = np.hypot(delta[:, 0], delta[:, 1])
+        if self.a.ranges is not None and self.b.ranges is not None:
+            components["range"] = self.a.ranges - self.b.ranges
+        return components
+
+
+class _Sampled(NamedTuple):
+    """Points of a cloud whose keys are below a limit."""
+
+    kept: _KeyedPoints
+    point_count: int  # number of points in the cloud
+    limit: int
+
+    @classmethod
+    def read(cls, cloud: SurveyCloud, key: PairKey, max_points: int) -> _Sampled:
+        """Read a cloud, and reduce the limit until at most `max_points` points remain."""
+        limit = _BITS
+        kept: list[_KeyedPoints] = []
+        point_count = 0
+        for part in cloud.parts():
+            kept.append(_below(key.of(part), limit))
+            point_count += len(part)
+            while sum(len(keyed.keys) for keyed in kept) > max_points:
+                limit //= 2
+                kept = [_below(keyed, limit) for keyed in kept]
+        ranges = [keyed.ranges for keyed in kept if keyed.ranges is not None]
+        joined = _KeyedPoints(
+            np.concatenate([np.zeros(0, np.uint64), *(keyed.keys for keyed in kept)]),
+            np.concatenate([np.zeros((0, 3)), *(keyed.points for keyed in kept)]),
+            np.concatenate([np.zeros(0), *ranges]) if key.has_ranges else None,
+        )
+        return cls(joined, point_count, limit)
+
+
+def _below(keyed: _KeyedPoints, limit: int) -> _KeyedPoints:
+    """Return the points whose keys are below a limit."""
+    if limit >= _BITS:
+        return keyed
+    return keyed.select(np.flatnonzero(keyed.keys < np.uint64(limit)))
+
+
+def _unique_keys(keys: AnyArray) -> tuple[AnyArray, Indices]:
+    """Return the keys that occur once, in ascending order, and their rows."""
+    order = np.argsort(keys)
+    ordered = keys[order]
+    repeated = np.zeros(len(keys), np.bool_)
+    same = ordered[1:] == ordered[:-1]
+    repeated[1:] |= same
+    repeated[:-1] |= same
+    return ordered[~repeated], order[~repeated]

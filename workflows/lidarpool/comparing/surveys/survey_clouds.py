@@ -1,0 +1,201 @@
+"""Survey clouds in world coordinates, with the coordinate system and the unit that they state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.schema.vocabulary import UNITS_M
+
+from ...clouds.recording import Recording, SeveralSensorsError
+from ...columns.parts import StoredCloud
+from ...recordings.opening import open_recording
+from ..compared_sweep import check_reach
+
+CloudSource = str | Path | Cloud | StoredCloud
+SENSOR = "sensor_number"  # column that contains the index of the sensor
+_MILLIONTH = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyCloud:
+    """A cloud in world coordinates, or the sweeps of all sensors of a survey."""
+
+    name: str
+    recordings: tuple[Recording, ...]  # one per sensor
+    unit: str | None  # unit that the user chose
+
+    @classmethod
+    def open(
+        cls,
+        source: CloudSource,
+        name: str,
+        *,
+        sensor: str | None = None,
+        unit: str | None = None,
+        keep_noise: bool = False,
+    ) -> SurveyCloud:
+        """Open a cloud, with all of its sensors unless one is chosen.
+
+        `name` is used in messages if the source is a cloud in memory.
+
+        Raises LidarError if the cloud cannot be read, or if its sensors have different world frames
+        and none is chosen.
+        """
+
+        def opened(chosen: str | None) -> Recording:
+            return open_recording(source, chosen, name=name, unit=unit, keep_noise=keep_noise)
+
+        try:
+            recordings = [opened(sensor)]
+        except SeveralSensorsError as error:
+            recordings = [opened(chosen) for chosen in error.names]
+            if len({recording.sequence for recording in recordings}) > 1:
+                raise
+        return cls(recordings[0].name, tuple(recordings), unit)
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes of the recordings, including those about points that were omitted."""
+        notes = [note for one in self.recordings for note in (*one.notes, *one.omission_notes)]
+        return list(dict.fromkeys(notes))
+
+    @property
+    def point_count(self) -> int | None:
+        """Number of points, or None if it is not known before the points are read."""
+        counts = [recording.point_count for recording in self.recordings]
+        return None if None in counts else sum(filter(None, counts))
+
+    @cached_property
+    def epsg(self) -> int | None:
+        """EPSG code of the coordinate system, or None if the file does not state it."""
+        first = self.recordings[0]
+        return first.epsg if first.system is None else first.system.epsg
+
+    @cached_property
+    def system_name(self) -> str | None:
+        """Name of the coordinate system, or None if the file does not state it."""
+        if self.epsg is not None:
+            return f"EPSG:{self.epsg}"
+        system = self.recordings[0].system
+        return None if system is None else system.name
+
+    @property
+    def unit_name(self) -> str:
+        """Name of the length unit of the file."""
+        meters = self.recordings[0].meters[0]
+        names = (name for name, unit_m in UNITS_M.items() if abs(unit_m / meters - 1) < _MILLIONTH)
+        return next(names, f"units of {meters:.10g} m")
+
+    def parts(self) -> Iterator[Sweep]:
+        """Yield all points in world coordinates, in parts of limited size.
+
+        The column `SENSOR` contains the index of the sensor. If the distances from the sensor are
+        known, the column `range` contains them.
+
+        Raises LidarError if the cloud cannot be read, or if a pose is unknown.
+        """
+        for number, recording in enumerate(self.recordings):
+            for index in range(recording.count):
+                part = _world_points(recording, index)
+                if len(part):
+                    sensor = np.full(len(part), number, np.int64)
+                    yield part.replace(columns={**part.columns, SENSOR: sensor})
+
+    def sample(self, max_points: int) -> tuple[Floats, list[str]]:
+        """Read points, sampled evenly if there are more than about `max_points`.
+
+        Returns
+        -------
+        The points in world coordinates, with shape (n, 3), and notes for the user.
+        """
+        count = self.point_count
+        share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
+        chosen: list[Floats] = []
+        kept = 0
+        for part in self.parts():
+            rows = even_indices(len(part), round(share * len(part)))
+            chosen.append(part.points if share == 1 else part.points[rows])
+            kept += len(chosen[-1])
+            if kept > 1.5 * max_points:  # the number of points was unknown
+                chosen = [points[::2] for points in chosen]
+                share /= 2
+                kept = sum(map(len, chosen))
+        if not kept:
+            omitted = "".join(f" {note}." for note in self.notes)
+            raise LidarError(
+                f"{self.name} contains no points, so there is nothing to compare.{omitted}"
+            )
+        note = f"{100 * share:.3g} % of the points in {self.name} are used, sampled evenly"
+        return np.concatenate(chosen), [] if share == 1 else [note]
+
+
+def _world_points(recording: Recording, number: int) -> Sweep:
+    sweep = recording[number].returns()
+    check_reach(recording, sweep)
+    if recording.is_cloud:
+        return sweep
+    if sweep.pose is None:
+        raise LidarError(
+            f"{recording.name} is in sensor coordinates and does not contain the pose of the "
+            "sensor, so its points cannot be compared in world coordinates."
+        )
+    columns = sweep.columns
+    if "range" not in columns:
+        fired = sweep if recording.fired is None else recording.read_fired(number)
+        columns = {**columns, "range": np.linalg.norm(fired.points, axis=1)}
+    return sweep.replace(points=sweep.in_world(), columns=columns)
+
+
+def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
+    """Raise LidarError if clouds state different coordinate systems or units.
+
+    Returns notes about clouds that state no coordinate system although others do.
+    """
+    first, *others = clouds
+    for other in others:
+        if first.system_name and other.system_name and not _is_same_system(first, other):
+            raise LidarError(
+                f"{first.name} has the coordinate system {first.system_name}, but {other.name} has "
+                f"{other.system_name}. Transform one of them first, for example with "
+                "filters.reprojection of PDAL."
+            )
+        if first.unit_name != other.unit_name and not (first.unit or other.unit):
+            raise LidarError(
+                f"{first.name} has the unit {first.unit_name}, but {other.name} has "
+                f"{other.unit_name}. Convert one of them first, or state the units with "
+                "`--unit-a` and `--unit-b` if their origins and axes are the same."
+            )
+    stated = sorted({cloud.system_name for cloud in clouds if cloud.system_name})
+    if not stated:
+        return []
+    return [
+        f"{cloud.name} states no coordinate system and is assumed to be in {stated[0]}"
+        for cloud in clouds
+        if cloud.system_name is None
+    ]
+
+
+def _is_same_system(a: SurveyCloud, b: SurveyCloud) -> bool:
+    if a.epsg is not None and b.epsg is not None:
+        return a.epsg == b.epsg
+    return a.recordings[0].system == b.recordings[0].system or a.system_name == b.system_name
+
+
+def check_overlap(a: Floats, b: Floats, names: tuple[str, str], margin_m: float) -> None:
+    """Raise LidarError if the extents of two clouds are farther apart than a margin in meters."""
+    gap = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max()
+    if gap > margin_m:
+        raise LidarError(
+            f"The extents of {names[0]} and {names[1]} are {gap:,.3f} m apart, so there is nothing "
+            "to compare. Check their coordinate systems, or increase the maximum distance."
+        )
