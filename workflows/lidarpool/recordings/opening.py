@@ -31,7 +31,11 @@ _CONVERSIONS = {  # {ending of an unsupported format: advice}
     **dict.fromkeys(
         (".osi", ".osi.gz"), "It is an OSI trace. Use it as the traffic of a scenario."
     ),
-    **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
+    **dict.fromkeys(
+        (".glb", ".gltf", ".obj", ".stl"),
+        "It is a mesh. Run a survey of it first, "
+        "or compare a cloud with it with `lidarpool compare CLOUD MESH --survey mesh`.",
+    ),
 }
 # Extensions of files for which the user can set the unit.
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))

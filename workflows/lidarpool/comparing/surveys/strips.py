@@ -25,10 +25,14 @@ from .deviations import Deviations, statistics
 from .survey_clouds import SENSOR, SurveyCloud
 
 SOURCE = "point_source_id"
-_MIN_POINTS = 4  # minimum number of points per strip in a cell; three always lie on a plane
+_MIN_POINTS = 5  # minimum number of points per strip in a cell; three always lie on a plane
 _MAX_ROWS = 12_000_000  # maximum number of cells of all strips, about 1.5 GB
 _PENDING_ROWS = 4_000_000  # rows that are merged together
-_MAX_CONDITION = 1e4  # points on a line determine no plane
+# Points on a line determine no plane, and a plane is not extrapolated far. Both are fractions of the
+# width of a cell.
+_MIN_SPREAD = 0.1  # minimum standard deviation of the positions in every direction
+_MAX_OFFSET = 0.3  # maximum distance between the mean positions of the points of two strips
+_MAX_STRIPS = 1 << 16
 _CELLS = 1 << 20  # maximum number of cells from the origin along each axis
 # Sums over the points of a strip in a cell: number, dx, dy, h, dx², dx dy, dy², dx h, dy h, h²,
 # where dx and dy are relative to the center of the cell.
@@ -63,6 +67,10 @@ class _Strips:
             self.numbers.setdefault((file, sensor, source), len(self.numbers))
             for sensor, source in joint.tolist()
         ]
+        if len(self.numbers) > _MAX_STRIPS:
+            raise LidarError(
+                f"The input contains more than {_MAX_STRIPS:,} strips. Compare fewer files at once."
+            )
         return np.array(numbers, np.int64)[inverse.reshape(-1)]
 
     def names(self, clouds: Sequence[SurveyCloud]) -> list[str]:
@@ -107,7 +115,7 @@ def strip_deviations(clouds: Sequence[SurveyCloud], settings: StripSettings) -> 
     if not len(overlap.difference_m):
         raise LidarError(
             f"No two of the {len(names):,} strips have comparable cells in common. Increase "
-            "`--cell` so that a cell contains at least 4 points of each strip, or increase "
+            "`--cell` so that a cell contains at least 5 points of each strip, or increase "
             "`--max-roughness`."
         )
     figures = {
@@ -237,11 +245,11 @@ class _Overlap(NamedTuple):
     rough: int  # number of cells that are not compared because they are too rough
 
 
-def _cell_planes(cells: _CellSums, max_roughness_m: float) -> _CellPlanes:
+def _cell_planes(cells: _CellSums, settings: StripSettings) -> _CellPlanes:
     """Fit planes by least squares in the cells that have enough points which are not on a line."""
     sums = cells.sums
     rows = np.flatnonzero(sums[:, 0] >= _MIN_POINTS)
-    rows = rows[_are_spread(sums[rows])]
+    rows = rows[_smallest_spread(sums[rows]) >= _MIN_SPREAD * settings.cell_m]
     keys, sums = cells.keys[rows], sums[rows]
     # Columns of `_SUMS`: the normal equations of h = a + b dx + c dy.
     matrix = sums[:, [[0, 1, 2], [1, 4, 5], [2, 5, 6]]]
@@ -250,39 +258,50 @@ def _cell_planes(cells: _CellSums, max_roughness_m: float) -> _CellPlanes:
     squares = np.maximum(sums[:, 9] - np.einsum("ni,ni->n", planes, right), 0)
     roughness = np.sqrt(squares / (sums[:, 0] - 3))
     means: Floats = sums[:, 1:3] / sums[:, :1]
-    return _CellPlanes(keys >> 16, keys & 0xFFFF, planes, means, roughness <= max_roughness_m)
+    is_smooth = roughness <= settings.max_roughness_m
+    return _CellPlanes(keys >> 16, keys & 0xFFFF, planes, means, is_smooth)
 
 
-def _are_spread(sums: Floats) -> Bools:
-    """Return whether the points in each cell are not on a line."""
+def _smallest_spread(sums: Floats) -> Floats:
+    """Return the standard deviation of the positions in each cell, in the narrowest direction."""
     n, x, y, _, xx, xy, yy = sums[:, :7].T
-    a, b, c = xx - x * x / n, xy - x * y / n, yy - y * y / n
+    a, b, c = (xx - x * x / n) / n, (xy - x * y / n) / n, (yy - y * y / n) / n
     smallest = (a + c) / 2 - np.hypot((a - c) / 2, b)  # eigenvalue of ((a, b), (b, c))
-    return np.asarray(smallest * _MAX_CONDITION > a + c)
+    return np.sqrt(np.maximum(smallest, 0))
 
 
 def _overlaps(cells: _CellSums, count: int, settings: StripSettings) -> _Overlap:
     """Return the height differences of all pairs of strips in all cells."""
-    planes = _cell_planes(cells, settings.max_roughness_m)
-    first: list[Indices] = []
-    second: list[Indices] = []
-    rows = np.arange(len(planes.cells))
-    for step in range(1, count):  # rows of a cell are adjacent
-        same = rows[:-step][planes.cells[step:] == planes.cells[:-step]]
-        if not len(same):
-            break
-        first.append(same)
-        second.append(same + step)
-    a, b = (np.concatenate([np.zeros(0, np.intp), *parts]) for parts in (first, second))
+    planes = _cell_planes(cells, settings)
+    a, b = _rows_of_pairs(planes.cells, count)
+    apart = np.linalg.norm(planes.means[a] - planes.means[b], axis=1)
+    near = apart <= _MAX_OFFSET * settings.cell_m
     smooth = planes.is_smooth[a] & planes.is_smooth[b]
-    rough = int(np.count_nonzero(~smooth))
-    a, b = a[smooth], b[smooth]
+    rough = int(np.count_nonzero(near & ~smooth))
+    a, b = a[near & smooth], b[near & smooth]
     place = (planes.means[a] + planes.means[b]) / 2  # where neither plane is extrapolated far
     difference = planes.planes[a] - planes.planes[b]
     heights = difference[:, 0] + np.einsum("ni,ni->n", difference[:, 1:], place)
     key = planes.cells[a]
     columns_rows = np.stack([key >> 21, key & (2 * _CELLS - 1)], axis=1) - _CELLS
     return _Overlap(heights, columns_rows, planes.strips[a], planes.strips[b], rough)
+
+
+def _rows_of_pairs(cells: Ints, count: int) -> tuple[Indices, Indices]:
+    """Return the rows of all pairs of strips in the same cell. There are at most `count` strips.
+
+    The cells are sorted.
+    """
+    rows = np.arange(len(cells))
+    first: list[Indices] = [np.zeros(0, np.intp)]
+    second: list[Indices] = [np.zeros(0, np.intp)]
+    for step in range(1, count):
+        same = rows[:-step][cells[step:] == cells[:-step]]
+        if not len(same):
+            break
+        first.append(same)
+        second.append(same + step)
+    return np.concatenate(first), np.concatenate(second)
 
 
 def _pair_figures(
