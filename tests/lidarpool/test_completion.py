@@ -51,7 +51,10 @@ OS1 = ["ouster/os1-128", "ouster/os1-32", "ouster/os1-64"]
         ("lidarpool run hall.glb --sensor=ouster/os1", OS1),
         ("lidarpool check hall.glb --sensor ouster/os1", OS1),
         ("lidarpool init --mesh hall.glb --sensor ouster/os1", OS1),
-        ("lidarpool stations hall.glb --sensor riegl-vz", ["riegl-vz400"]),
+        (
+            "lidarpool stations hall.glb --sensor riegl-vz",
+            ["riegl-vz1000", "riegl-vz2000i", "riegl-vz400"],
+        ),
         ("lidarpool fit a.pcap --model ouster/os1", OS1),
         ("lidarpool augment a.pcap --sensor ouster/os1", OS1),
         ("lidarpool augment a.pcap --insert ", ["car", "pedestrian"]),

@@ -191,3 +191,49 @@ def test_the_command_shows_what_a_data_sheet_says(tmp_path):
     assert "noise        range_m: 0.02, angle_deg: 0.1, detection_range_m: 100.9" in run.output
     assert "returns      mode: strongest, subrays: 7" in run.output
     assert "unknown      false alarms (noise.false_alarm_hz)" in run.output
+
+
+# As the sources of each file state them: points and pulses per second, degrees of a line, distance
+# from the sensor in meters, standard deviation in millimeters, divergence in mrad.
+SURVEYING = {
+    "terrestrial/riegl-vz1000": (125_000, 300_000, 100, 2.5, 8, 0.3),
+    "terrestrial/riegl-vz2000i": (500_000, 1_200_000, 100, 1.5, 5, 0.27),
+    "mobile/riegl-vq450": (550_000, 550_000, 360, 1.5, 8, 0.3),
+    "mobile/riegl-vux1ha22": (1_800_000, 1_800_000, 360, 1, 5, 0.5),
+    "drone/riegl-vux1uav": (504_000, 550_000, 330, 3, 10, 0.5),
+    "drone/riegl-vux1uav22": (1_200_000, 1_200_000, 360, 3, 10, 0.5),
+    "drone/dji-zenmuse-l1": (240_000, None, None, 1, 20, 0.89),
+}
+
+
+@pytest.mark.parametrize("name", SURVEYING)
+def test_scanners_of_surveys_have_the_rates_and_angles_of_their_sources(name):
+    points_s, pulses_s, width_deg, min_m, sigma_mm, divergence_mrad = SURVEYING[name]
+    sensor = load_sensor(name, performance="datasheet")
+    head = sensor.head
+    assert sensor.channels * head.firings_per_turn * head.rate_hz == pytest.approx(
+        points_s, rel=1e-3
+    )
+    assert sensor.min_range_m == min_m
+    assert sensor.noise.range_m == pytest.approx(sigma_mm / 1000)
+    assert sensor.optics.divergence_mrad == divergence_mrad
+    if pulses_s is None:
+        return
+    count = round(head.firings_per_turn) if sensor.channels == 1 else 1
+    times_s = np.sort(sensor.times_ns(np.arange(count)).ravel()) / 1e9
+    assert 1 / np.median(np.diff(times_s)) == pytest.approx(pulses_s, rel=2e-3)
+    directions = sensor.directions(np.arange(count)).reshape(-1, 3)
+    steps = np.arccos(np.clip(np.sum(directions[1:] * directions[:-1], axis=1), -1, 1))
+    assert np.degrees(steps.sum()) == pytest.approx(width_deg, rel=2e-3)
+
+
+def test_a_zenmuse_l1_has_the_field_of_view_of_its_guide_and_its_detection_range():
+    sensor = load_sensor("drone/dji-zenmuse-l1", performance="datasheet")
+    x, y, z = sensor.directions(np.arange(40_000)).reshape(-1, 3).T
+    across, along = (np.degrees(np.arctan2(side, x)) for side in (y, z))
+    assert np.ptp(across) == pytest.approx(70.4, abs=4) or np.ptp(along) == pytest.approx(
+        70.4, abs=4
+    )
+    assert max(np.ptp(across), np.ptp(along)) == pytest.approx(77.2, abs=4)
+    detection = Detection(range_m=190, probability=0.9)
+    assert sensor.noise.detection_range_m == pytest.approx(detection.threshold_m)

@@ -20,6 +20,7 @@ _GAP = 0.06  # between maps, as a fraction of the width
 _TOP = 150  # pixels
 _BOTTOM = 90
 _ROW_GAP = 80
+_MAX_HEIGHT = 620  # of a map, in pixels
 _COLORS = "RdBu_r"
 _MAPPED = ("delta_e", "delta_n", "delta_h", "distance")
 _MAX_CELLS = 240  # cells of a map along its longer side
@@ -47,7 +48,7 @@ class _MapLayout(NamedTuple):
         rows = count // columns
         total = (_RIGHT - _LEFT) * _WIDTH
         width = (total - (columns - 1) * _GAP * _WIDTH) / columns
-        height = float(np.clip(width / aspect, 130, 620))
+        height = float(np.clip(width / aspect, 130, _MAX_HEIGHT))
         return cls(columns, rows, width, height)
 
     @property
@@ -88,7 +89,7 @@ def draw_maps(
     ramp = theme.apply_colormap(_COLORS, np.linspace(0, 1, 256))
     bottom = layout.frame(len(names) - 1)[1]
     top = layout.frame(0)[1] + layout.frame(0)[3]
-    page.color_bar(ramp, norm, "A − B, mm", (0.885, bottom, 0.014, top - bottom))
+    page.color_bar(ramp, norm, "A − B, mm", (_RIGHT + 0.025, bottom, 0.014, top - bottom))
     return page
 
 
