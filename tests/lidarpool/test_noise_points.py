@@ -5,7 +5,7 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import Comparison, LidarError, Scene, compare
-from lidarpool.cli.result_commands import compare as compare_command
+from lidarpool.cli.compare_command import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording

@@ -28,8 +28,8 @@ SOURCE = "point_source_id"
 _MIN_POINTS = 5  # minimum number of points per strip in a cell; three always lie on a plane
 _MAX_ROWS = 12_000_000  # maximum number of cells of all strips, about 1.5 GB
 _PENDING_ROWS = 4_000_000  # rows that are merged together
-# Points on a line determine no plane, and a plane is not extrapolated far. Both are fractions of the
-# width of a cell.
+# Points on a line determine no plane, and a plane is not extrapolated far. Both values are relative
+# to the width of a cell.
 _MIN_SPREAD = 0.1  # minimum standard deviation of the positions in every direction
 _MAX_OFFSET = 0.3  # maximum distance between the mean positions of the points of two strips
 _MAX_STRIPS = 1 << 16
