@@ -212,6 +212,8 @@ def test_an_open_mesh_is_positive_in_front_of_its_triangles(tmp_path):
 
 def test_strips_have_the_height_difference_between_them():
     first, second = plane(8000, tilt_deg=8), plane(8000, seed=11, tilt_deg=8, height=-0.07)
+    for points in (first, second):
+        points[:, 2] += 0.3 * (points[:, 1] - ORIGIN[1])
     found = compare_strips(cloud(first), cloud(second[second[:, 1] > ORIGIN[1] + 10]), cell_m=2.0)
     (overlap,) = found.figures["overlaps"]
     assert (overlap["a"], overlap["b"]) == ("cloud 1", "cloud 2")

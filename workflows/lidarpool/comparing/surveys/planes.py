@@ -16,7 +16,7 @@ from .deviations import Deviations
 _BATCH = 100_000  # points per batch, which limits the memory for their neighbors
 _NEIGHBORS = 24  # maximum number of points that determine a plane
 _MIN_NEIGHBORS = 6
-_MIN_WIDTH = 0.1  # minimum width of a neighborhood relative to its length; lines have no plane
+_MIN_WIDTH = 0.2  # minimum width of a neighborhood relative to its length; lines have no plane
 _SAMPLES = 2000
 _LEVEL = 0.05  # normals with a smaller vertical component are horizontal (3 degrees)
 
