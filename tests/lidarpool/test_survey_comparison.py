@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from importlib.util import find_spec
 
 import laspy
@@ -13,9 +14,10 @@ import trimesh
 from click.testing import CliRunner
 from rasterio.crs import CRS
 
-from lidarpool import Cloud, LidarError, compare_strips, compare_surveys
+from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare_strips, compare_surveys
 from lidarpool.cli.commands import cli
 from lidarpool.comparing.surveys import pairs
+from lidarsim.sweeps.sweeps import Sweeps
 
 ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])
 SHIFT = (0.03, -0.02, 0.05)
@@ -290,6 +292,18 @@ def test_different_coordinate_systems_are_refused(tmp_path):
     found = compare_surveys(none, a)
     assert found.figures["coordinate_system"] == "EPSG:25832"
     assert any("is assumed to be in EPSG:25832" in note for note in found.figures["notes"])
+
+
+def test_results_in_different_coordinate_systems_are_refused():
+    survey = Survey(Sensor.grid(360, 4), poses=[(0, 0, 0)], steps=36)
+    sweeps = replace(Sweeps.from_survey(survey, Scene.seed()), coordinates="world")
+    columns = {name: np.zeros(100, int) for name in ("scan", "channel", "object")}
+    a, b = (
+        Cloud(plane(100), columns, sweeps=lambda epsg=epsg: replace(sweeps, epsg=epsg))
+        for epsg in (25832, 25833)
+    )
+    with pytest.raises(LidarError, match="cloud A has the coordinate system EPSG:25832, but"):
+        compare_surveys(a, b)
 
 
 def test_different_units_are_refused(tmp_path):
