@@ -1,4 +1,4 @@
-"""Sweeps as topics of ROS 2, read by cyclonedds, which is not a dependency: tests skip without."""
+"""Sweeps as topics of ROS 2, read by cyclonedds; tests skip without it."""
 
 from __future__ import annotations
 
