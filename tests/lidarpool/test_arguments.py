@@ -29,6 +29,7 @@ from lidarpool import (
     Mounted,
     MujocoScanner,
     Navigation,
+    NewtonScanner,
     Noise,
     Optics,
     Packets,
@@ -169,6 +170,7 @@ WRONG = {
     ],
     SCANNER.move: [("Car", AT[0], "Unknown actor or instance 'Car'")],
     MujocoScanner: [(None, GRID, "body=NAME or site=NAME")],
+    NewtonScanner: [(None, GRID, "body=LABEL or site=LABEL")],
     load_sensor: [(3, "Unknown sensor model '3'")],
     # A file that does not exist.
     Campaign.load: [("a.yaml", "not exist")],

@@ -101,10 +101,10 @@ def test_it_is_one_line(thing):
 
 def test_every_public_class_is_among_them():
     # Results, comparisons, fits and twins are printed as tables. Robots, scans, sweeps and
-    # recordings have tests of their own. MujocoScanner requires MuJoCo, and views of scanners
-    # require a viewer.
+    # recordings have tests of their own. The scanners of MuJoCo and Newton require these programs,
+    # and views of scanners require a viewer.
     elsewhere = {"Result", "Comparison", "Fit", "PatternFit", "Twin", "Robot", "ScanSpec", "Sweep"}
-    elsewhere |= {"LidarError", "MujocoScanner", "Foxglove", "Rerun", "Recording"}
+    elsewhere |= {"LidarError", "MujocoScanner", "NewtonScanner", "Foxglove", "Rerun", "Recording"}
     public = {n for n in lidarpool.__all__ if isinstance(getattr(lidarpool, n), type)}
     parts = {"Imu", "Gnss"}  # of Navigation
     assert (

@@ -240,6 +240,20 @@ def test_without_a_number_only_the_random_numbers_advance(scene, sensor):
     assert len({image.tobytes() for image in images}) == 4
 
 
+def test_streams_are_independent(scene):
+    given = {"columns": COLUMNS, "backend": "numpy"}
+    before = Scanner(scene, GRID, **given).sweep(BEND, number=3)
+    scanner = Scanner(scene, GRID, noise=Noise(0.1, velocity_m_s=1), **given)
+    clouds = [scanner.sweep(BEND, number=3, stream=stream) for stream in (0, 1, 2**31 - 1)]
+    assert same(clouds[0], scanner.sweep(BEND, number=3))
+    assert all(np.array_equal(cloud["time"], before["time"]) for cloud in clouds)
+    for name in ("range", "radial_velocity"):
+        errors = [cloud[name] - before[name] for cloud in clouds]
+        assert correlations(*errors) < 5 / np.sqrt(len(before)), "5 standard deviations"
+    images = [scanner.ranges(HERE, number=3, stream=stream) for stream in (0, 0, 1)]
+    assert np.array_equal(*images[:2]) and not np.array_equal(*images[1:])
+
+
 def test_poses_can_be_given_in_several_forms(scene):
     scanner = Scanner(scene, GRID, backend="numpy")
     places = np.array([[0, 0, 1], [1, -1, 2.0]])
@@ -590,6 +604,7 @@ WRONG = {
         lambda s: Scanner(FAR, GRID, precision_m=1e-6).sweep((2990, 0, 1)),
         "precision_m is 1e-06, which is too fine for points 2",
     ),
+    "stream": (lambda s: s.sweep(HERE, stream=-1), "stream must … but is -1"),
     "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads must be at least 1"),
     "names": (
         lambda s: Scanner(Scene.seed(), Mounted(GRID, name="left"), name="right"),

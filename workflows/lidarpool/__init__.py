@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lidarsim.simulator import Scanner
     from lidarsim.survey.faults import Fault
     from lidarsim.survey.survey import Mounted, ScanSpec, Survey
-    from lidarsim.worlds import MujocoScanner
+    from lidarsim.worlds import MujocoScanner, NewtonScanner
     from lidarsim.worlds.follower import Follower
 
     from .api.dask_frames import to_dask
@@ -81,6 +81,7 @@ __all__ = [
     "Mounted",
     "MujocoScanner",
     "Navigation",
+    "NewtonScanner",
     "Noise",
     "Optics",
     "Packets",

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .simulator import Scanner
     from .survey.faults import Fault
     from .survey.survey import Mounted, ScanSpec, Survey
-    from .worlds import MujocoScanner
+    from .worlds import MujocoScanner, NewtonScanner
     from .worlds.follower import Follower
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "Mounted",
     "MujocoScanner",
     "Navigation",
+    "NewtonScanner",
     "Noise",
     "Optics",
     "Packets",
@@ -88,7 +89,7 @@ _MODULES = {
     "simulator": ("Scanner",),
     "survey.faults": ("Fault",),
     "survey.survey": ("Mounted", "ScanSpec", "Survey"),
-    "worlds": ("MujocoScanner",),
+    "worlds": ("MujocoScanner", "NewtonScanner"),
     "worlds.follower": ("Follower",),
 }
 

@@ -45,7 +45,8 @@ from lidarsim.worlds.mujoco_bodies import (
     names_of,
     visible_geoms,
 )
-from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, count_segments
+from lidarsim.worlds.mujoco_geoms import GeomType
+from lidarsim.worlds.shape_meshes import SAG_M, count_segments
 
 from ..files.child_process import ReaderProcess
 from .model_sources import check_sources

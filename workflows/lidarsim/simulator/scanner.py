@@ -43,6 +43,7 @@ _MAX_REVOLUTIONS = 4  # number of revolutions whose scans are stored
 MAX_START_S = 9e9  # times are int64 nanoseconds
 SweepNumber = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
 StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
+StreamNumber = Annotated[int, Field(ge=0, lt=MAX_SCANS)]
 
 
 class Scanner:
@@ -228,6 +229,7 @@ class Scanner:
         *,
         number: int | None = None,
         start_s: float | None = None,
+        stream: int = 0,
     ) -> Cloud:
         """Simulate a sweep, which is one revolution of the head or one frame.
 
@@ -243,6 +245,10 @@ class Scanner:
         start_s
             Start of the revolution in seconds since the start of the trajectories of the sensor and
             the actors. The default is `number` times the duration of a revolution, as in a survey.
+        stream
+            Number of the stream of random numbers, which are independent of those of other streams.
+            Use a different stream for each of several lidars of the same model that share the
+            scanner.
 
         Returns
         -------
@@ -256,7 +262,7 @@ class Scanner:
         """
         path = _trajectory_of(pose)
         with self._casting() as rig:
-            specs, late_ns = self._specs(rig, number, start_s, 1)
+            specs, late_ns = self._specs(rig, number, start_s, stream=stream)
             begin_ns, end_ns = _span_ns(rig, specs)
             if end_ns > path.duration_ns:
                 raise LidarError(
@@ -288,6 +294,7 @@ class Scanner:
         *,
         number: int | None = None,
         start_s: float | None = None,
+        stream: int = 0,
     ) -> Floats32:
         """Simulate the range images that the sensor measures from several poses.
 
@@ -304,6 +311,8 @@ class Scanner:
             revolution ``number + i``.
         start_s
             Start of the revolution in seconds, which determines the poses of actors, as in `sweep`.
+        stream
+            Number of the stream of random numbers, as in `sweep`.
 
         Returns
         -------
@@ -319,7 +328,7 @@ class Scanner:
         """
         positions, rotations = _poses_of(poses)
         with self._casting() as rig:
-            specs, _ = self._specs(rig, number, start_s, len(positions))
+            specs, _ = self._specs(rig, number, start_s, len(positions), stream)
             if not len(positions):
                 firings = specs[-1].firings[1] - specs[0].firings[0]
                 return np.empty((0, firings, specs[0].channels), np.float32)
@@ -484,7 +493,12 @@ class Scanner:
                 self._lock.notify_all()
 
     def _specs(
-        self, rig: Rig, number: int | None, start_s: float | None, count: int
+        self,
+        rig: Rig,
+        number: int | None,
+        start_s: float | None,
+        count: int = 1,
+        stream: int = 0,
     ) -> tuple[list[ScanSpec], float]:
         """Return the scans of a revolution, and the delay of its start, in nanoseconds.
 
@@ -498,22 +512,28 @@ class Scanner:
             with self._lock:
                 revolutions_ahead = self._unnumbered
                 self._unnumbered += count
-        specs, late_ns = self._scans_of(rig, number or 0, start_s, revolutions_ahead)
+        specs, late_ns = self._scans_of(rig, number or 0, start_s, revolutions_ahead, stream)
         if rig.scene.actors:
             begin_ns, end_ns = _span_ns(rig, specs)
             rig.check_actors(begin_ns, end_ns)
         return specs, late_ns
 
     def _scans_of(
-        self, rig: Rig, number: int, start_s: float | None, revolutions_ahead: int = 0
+        self,
+        rig: Rig,
+        number: int,
+        start_s: float | None,
+        revolutions_ahead: int = 0,
+        stream: int = 0,
     ) -> tuple[list[ScanSpec], float]:
         """Return the scans of revolution `number`, and the delay of its start, in nanoseconds.
 
-        The random numbers are those of the revolution that follows `revolutions_ahead` later
-        (`ScanSpec.random_offset`).
+        The random numbers are those of the revolution that follows `revolutions_ahead` later in a
+        stream (`ScanSpec.random_offset`).
         """
         check_fits("number", number, SweepNumber)
         check_fits("start_s", start_s, StartSeconds)
+        check_fits("stream", stream, StreamNumber)
         sensor = rig.survey.sensor
         specs = self._revolution(sensor, number)
         if specs[-1].scan >= MAX_SCANS:
@@ -521,7 +541,7 @@ class Scanner:
         late_ns = (
             0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
-        ahead = revolutions_ahead * len(specs)
+        ahead = revolutions_ahead * len(specs) + stream * MAX_SCANS
         return [spec.with_offsets(late_ns, ahead) for spec in specs], late_ns
 
     def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:

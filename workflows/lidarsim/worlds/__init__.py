@@ -4,6 +4,7 @@ The programs themselves are not imported.
 """
 
 from .mujoco_scanner import MujocoScanner
+from .newton_scanner import NewtonScanner
 from .world_follower import WorldFollower
 
-__all__ = ["MujocoScanner", "WorldFollower"]
+__all__ = ["MujocoScanner", "NewtonScanner", "WorldFollower"]

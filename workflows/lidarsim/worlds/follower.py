@@ -42,12 +42,42 @@ class _Step(NamedTuple):
     matrices: Floats  # (k, 4, 4), from the body frames to the world
 
 
+class _StepLog:
+    """Recorded time steps of a world, and the number of the current sweep."""
+
+    def __init__(self, start_s: float) -> None:
+        self.start_s = start_s  # time of the first step
+        self.number = 0
+        self.steps: deque[_Step] = deque()
+        # Times of the first and last beam of the current sweep, in seconds since the first step.
+        self.span_s: tuple[float, float] | None = None
+
+    def precedes(self, time_s: float) -> bool:
+        """Return whether the last step is not after a time."""
+        return not self.steps or self.start_s + self.steps[-1].time_s <= time_s
+
+    def add(self, step: _Step) -> None:
+        """Add a step. It replaces the last step if both have the same time."""
+        if self.steps and step.time_s == self.steps[-1].time_s:
+            self.steps.pop()
+        self.steps.append(step)
+
+    def drop_before(self, start_s: float) -> None:
+        """Discard the steps that are no longer needed for times after `start_s`."""
+        while len(self.steps) > 2 and self.steps[1].time_s <= start_s:
+            self.steps.popleft()
+
+
 class Follower:
     """A lidar in a world that another program controls.
 
     `sweep` and `ranges` scan the world as if it were stationary, which is the fastest method.
     `step` records the time steps of a moving world, and simulates each sweep once its last beam has
     been fired. Each beam then uses the poses of the sensor and of the bodies at its firing time.
+
+    If several worlds have the same bodies at different poses, such as the environments of a
+    vectorized simulation, a single follower is sufficient. Pass the index of the world to its
+    methods.
 
     Parameters
     ----------
@@ -108,11 +138,7 @@ class Follower:
         # Scanner of a world that is stationary during each sweep.
         self._frozen = Scanner(Scene.from_meshes([*static, *instances]), sensor, **options)
         self._matrices = np.tile(np.eye(4), (len(bodies), 1, 1))
-        self._steps: deque[_Step] = deque()
-        self._start_s: float | None = None  # time of the first step
-        self._number = 0  # index of the current sweep
-        # Times of the first and last beam of the current sweep, in seconds since the first step.
-        self._span_s: tuple[float, float] | None = None
+        self._logs: dict[int, _StepLog] = {}  # {index of the world: its steps}
 
     @classmethod
     def from_world(
@@ -180,7 +206,12 @@ class Follower:
         return self._frozen.backend
 
     def sweep(
-        self, pose: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
+        self,
+        pose: ArrayLike,
+        matrices: ArrayLike = (),
+        *,
+        number: int | None = None,
+        world: int = 0,
     ) -> Cloud:
         """Simulate a sweep of the world in its current state.
 
@@ -192,6 +223,8 @@ class Follower:
             Matrices from the frames of the bodies to the world, in meters. Shape (k, 4, 4).
         number
             Number of the sweep, as in `Scanner.sweep`. By default, each call has new noise.
+        world
+            Index of the world. The noise in different worlds is independent.
 
         Returns
         -------
@@ -208,10 +241,15 @@ class Follower:
         self._move_bodies(_matrices(matrices, len(self._bodies)))
         origin = self._frozen.origin
         path = StaticPose(sensor_pose[0, :3, 3] - origin, sensor_pose[0, :3, :3])
-        return self._frozen.sweep(path, number=number)
+        return self._frozen.sweep(path, number=number, stream=world)
 
     def ranges(
-        self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
+        self,
+        poses: ArrayLike,
+        matrices: ArrayLike = (),
+        *,
+        number: int | None = None,
+        world: int = 0,
     ) -> Floats32:
         """Simulate the range images that a sensor measures in the current state of the world.
 
@@ -220,7 +258,7 @@ class Follower:
         poses
             Matrices from the frame of the sensor, or of its platform, to the world, for s poses.
             Shape (s, 4, 4).
-        matrices, number
+        matrices, number, world
             As in `sweep`.
 
         Returns
@@ -236,9 +274,12 @@ class Follower:
         """
         sensor_poses = _matrices(poses, None)
         self._move_bodies(_matrices(matrices, len(self._bodies)))
-        return self._frozen.ranges(_to_local(sensor_poses, self._frozen.origin), number=number)
+        local_poses = _to_local(sensor_poses, self._frozen.origin)
+        return self._frozen.ranges(local_poses, number=number, stream=world)
 
-    def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
+    def step(
+        self, time_s: float, pose: ArrayLike, matrices: ArrayLike = (), *, world: int = 0
+    ) -> list[Cloud]:
         """Record a time step of the world. Return the sweeps completed since the last step.
 
         The first sweep starts at the first step, and each further sweep starts where the previous
@@ -254,6 +295,8 @@ class Follower:
         matrices
             Matrices from the frames of the bodies to the world, in meters. Shape (k, 4, 4). Between
             two steps, bodies move at constant velocity and angular velocity.
+        world
+            Index of the world. Each world has its own steps and sweeps.
 
         Returns
         -------
@@ -266,52 +309,50 @@ class Follower:
             If the number of matrices differs from the number of bodies, a matrix is not a rigid
             transform, or the world contains nothing stationary.
         """
-        if self._start_s is None or (
-            self._steps and time_s < self._start_s + self._steps[-1].time_s
-        ):
-            self.reset()
-            self._start_s = time_s
-        step = _Step(
-            time_s - self._start_s,
-            _matrices(pose, 1)[0].copy(),
-            _matrices(matrices, len(self._bodies)).copy(),
+        log = self._logs.get(world)
+        if log is None or not log.precedes(time_s):
+            log = self._logs[world] = _StepLog(time_s)
+        log.add(
+            _Step(
+                time_s - log.start_s,
+                _matrices(pose, 1)[0].copy(),
+                _matrices(matrices, len(self._bodies)).copy(),
+            )
         )
-        if self._steps and step.time_s == self._steps[-1].time_s:
-            self._steps.pop()
-        self._steps.append(step)
-        return list(self._completed_sweeps())
+        return list(self._completed_sweeps(log, world))
 
-    def reset(self) -> None:
-        """Discard all recorded steps, so that the next step starts the first sweep again."""
-        self._steps.clear()
-        self._start_s = None
-        self._number = 0
-        self._span_s = None
+    def reset(self, world: int | None = None) -> None:
+        """Discard all recorded steps, so that the next step starts the first sweep again.
 
-    def _completed_sweeps(self) -> Iterator[Cloud]:
-        """Yield the sweeps whose last beam was fired no later than the last step."""
+        Parameters
+        ----------
+        world
+            Index of the world (default: all worlds).
+        """
+        if world is None:
+            self._logs.clear()
+        else:
+            self._logs.pop(world, None)
+
+    def _completed_sweeps(self, log: _StepLog, world: int) -> Iterator[Cloud]:
+        """Yield the sweeps of a world whose last beam was fired no later than the last step."""
         while True:
-            if self._span_s is None:
-                self._span_s = self._moving.span_s(self._number)
-            start_s, stop_s = self._span_s
-            if stop_s > self._steps[-1].time_s + _SLACK_S or len(self._steps) < 2:
+            if log.span_s is None:
+                log.span_s = self._moving.span_s(log.number)
+            start_s, stop_s = log.span_s
+            if stop_s > log.steps[-1].time_s + _SLACK_S or len(log.steps) < 2:
                 return
-            self._drop_steps(start_s)
-            times_s, poses, matrices = map(np.array, zip(*self._steps, strict=True))
+            log.drop_before(start_s)
+            times_s, poses, matrices = map(np.array, zip(*log.steps, strict=True))
             origin = self._moving.origin
             if self._bodies:
                 by_body = _to_local(matrices.transpose(1, 0, 2, 3), origin)
                 self._moving.move(self._body_names, by_body, times_s=times_s)
             # The first pose is held, because the scanner also requires the pose at time 0.
             (path,) = Track.from_matrices(times_s, _to_local(poses, origin)[None], "hold")
-            yield self._moving.sweep(path, number=self._number)
-            self._number += 1
-            self._span_s = None
-
-    def _drop_steps(self, start_s: float) -> None:
-        """Discard the steps that are no longer needed for times after `start_s`."""
-        while len(self._steps) > 2 and self._steps[1].time_s <= start_s:
-            self._steps.popleft()
+            yield self._moving.sweep(path, number=log.number, stream=world)
+            log.number += 1
+            log.span_s = None
 
     def _move_bodies(self, matrices: Floats) -> None:
         """Move the instances whose matrices have changed."""

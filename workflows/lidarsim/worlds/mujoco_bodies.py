@@ -16,7 +16,8 @@ from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stack_meshes
 from ..words import name_hint, plural
-from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, create_geom_mesh
+from .mujoco_geoms import create_geom_mesh
+from .shape_meshes import PLANE_M, SAG_M, ShapeMesh
 
 _COLOR_TEXTURE_ROLE = 1  # mjTEXROLE_RGB, a column index of mat_texid
 
@@ -218,11 +219,11 @@ def _mesh_of_geoms(
     )
 
 
-def _placed_geom(model: Any, geom: int, choice: BodySelection) -> GeomMesh:
+def _placed_geom(model: Any, geom: int, choice: BodySelection) -> ShapeMesh:
     """Create the mesh of a geom in the frame of its body."""
     shape = create_geom_mesh(model, geom, choice.sag_m, choice.plane_m)
     points = rotate(shape.vertices, _rotation(model.geom_quat[geom]))
-    return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
+    return ShapeMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
 
 
 def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMaterials | None:

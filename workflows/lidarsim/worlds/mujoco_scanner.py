@@ -22,7 +22,7 @@ from .mujoco_bodies import (
     find_excluded,
     require_id,
 )
-from .mujoco_geoms import SAG_M
+from .shape_meshes import SAG_M
 
 _log = logging.getLogger(__name__)
 
