@@ -102,10 +102,11 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
 
 
 @noinline
-def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
+def _find_poses(tile, rays, first, rays_per_pose, last_pose):  # type: ignore[no-untyped-def]
     """Write each ray's pose index, and its index among the rays that share the pose.
 
-    `first` is the `FirstRay` of the call. Rays that do not belong to the call use the closest pose.
+    `first` is the `FirstRay` of the call, and `last_pose` the pose of its last ray. Rays that do
+    not belong to the call use the closest of its poses.
     """
     numbers = int64s(tile)
     number_at = row_index(NUMBER, rays)
@@ -114,7 +115,7 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
     for lane in range(rays):
         inside = first.within + numbers[number_at + lane]
         later = _floor_divide(inside, rays_per_pose)
-        numbers[pose_at + lane] = min(max(first.pose + later, 0), poses - 1)
+        numbers[pose_at + lane] = min(max(first.pose + later, first.pose), last_pose)
         numbers[within_at + lane] = inside - later * rays_per_pose
 
 
@@ -464,7 +465,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays in a tile from their indices, in local coordinates.
 
     `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
-    scan, and `count` is the number of rays in the call. If there is a single pose, the tile may
+    scan, and `count` is the number of rays in the call, or 0 for any rays of the scan. The tile may
     also contain neighboring rays that do not belong to the call. If all rays share an origin,
     `write_shared_origin` must have written it to the tile. The rays are also written to the ray
     outputs of the cast, if there are any.
@@ -474,7 +475,10 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     first = first_ray(cast, start)
     _find_rows(tile, rays, first.row, cast.beam_count * cast.subrays)
     if cast.poses > 1 or cast.delays != 0:
-        _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
+        last_pose = cast.poses - 1
+        if count > 0:
+            last_pose = _floor_divide(start + count - 1, cast.rays_per_pose)
+        _find_poses(tile, rays, first, cast.rays_per_pose, last_pose)
     if cast.sub_ray_table != 0:
         if cast.lanes_per_beam == 1:
             _make_single_sub_rays(tile, rays, cast)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import TYPE_CHECKING, ClassVar
 from weakref import ref
 
@@ -20,7 +21,7 @@ from .instances import LocalScene
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
-from .tile_plan import TilePlan, plan_consecutive, plan_tiles
+from .tile_plan import TilePlan, image_rays, plan_consecutive, plan_tiles
 
 if TYPE_CHECKING:
     from .cast_record import CastRecord
@@ -122,7 +123,7 @@ class TileBackend(Backend):
 
         cast = self._ray_cast(rays)
         cast.record["index"] = 0  # Return rows of the corners, for `barycentric_weights`.
-        ray, distance, row, instance = self._cast(cast, 0, len(rays), plan_consecutive(1))
+        ray, distance, row, instance = self._cast(cast, [0, len(rays)], plan_consecutive(1))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
@@ -149,8 +150,10 @@ class TileBackend(Backend):
         """
         cast = self._scan_cast(scan)
         plan = self._plan(scan)
+        rays = image_rays(scan, plan.firing)
         for start, stop in scan.chunks(self.chunk):
-            yield start, stop, self._cast(cast, start, stop, plan)
+            cuts = range(start - start % rays + rays, stop, rays) if rays else ()
+            yield start, stop, self._cast(cast, [start, *cuts, stop], plan)
 
     def _plan(self, scan: Scan) -> TilePlan:
         """Return the tile plan for a scan, cached for scans with the same beams."""
@@ -218,25 +221,27 @@ class TileBackend(Backend):
         record = cast.record
         record["t_min"], record["t_max"] = self._local_limits(limits, self._scene.frame.scale)
 
-    def _cast(self, cast: CastRecord, start: int, stop: int, plan: TilePlan) -> HitColumns:
-        """Cast rays `start` to `stop`, and return their hits in ray order.
+    def _cast(self, cast: CastRecord, cuts: Sequence[int], plan: TilePlan) -> HitColumns:
+        """Cast consecutive ranges of rays, and return their hits in ray order.
 
-        Ray indices are relative to `start`.
+        `cuts` contains the first ray of each range, and finally the end of the last range. Rays in
+        different ranges do not share a tile. Ray indices are relative to the first ray.
 
         Distances are in meters. `triangle` contains indices in the caller's faces, or rows of the
         corners if the record's field `index` is 0.
         """
-        n = stop - start
+        start = cuts[0]
+        n = cuts[-1] - start
         ray = np.empty(n, np.uint32)
         distance = np.empty(n)
         triangle = np.empty(n, np.int32)
         instance = (np.empty if self._scene.has_matrices else np.zeros)(n, np.int32)
 
-        def cast_share(begin: int) -> HitColumns:
-            """Cast up to `share` rays, starting with ray `begin`. Return views of their hits."""
+        def cast_share(begin: int, stop: int) -> HitColumns:
+            """Cast rays `begin` to `stop`. Return views of their hits."""
             record = cast.record.copy()
             row = begin - start
-            hits = np.empty(2 * (min(share, stop - begin) + 1))
+            hits = np.empty(2 * (stop - begin + 1))
             record["hits"] = hits.ctypes.data
             record["tile"] = self._tile_address(plan.rays)
             record["tile_rays"] = plan.rays
@@ -250,17 +255,26 @@ class TileBackend(Backend):
             record["distance"] = distance[row:].ctypes.data
             record["triangle"] = triangle[row:].ctypes.data
             record["instance"] = instance[row:].ctypes.data
-            count = self._loops.cast_rays(record, begin, min(begin + share, stop))
+            count = self._loops.cast_rays(record, begin, stop)
             part = slice(row, row + count)
             return ray[part], distance[part], triangle[part], instance[part]
 
         column = plan.firing * plan.firings
         share = max(_SHARE // column, 1) * column
         if self._count == 1 or n <= share:
-            share = n
-            return cast_share(start)
+            ranges = [*pairwise(cuts)]
+            return (
+                cast_share(*ranges[0])
+                if len(ranges) == 1
+                else join_hits([cast_share(*one) for one in ranges])
+            )
         # A forked process does not have the threads of its parent.
         if self._process != os.getpid():
             self._threads = ThreadPoolExecutor(self._count, "tiles")
             self._process = os.getpid()
-        return join_hits(list(self._threads.map(cast_share, range(start, stop, share))))
+        shares = [
+            (begin, min(begin + share, last))
+            for first, last in pairwise(cuts)
+            for begin in range(first, last, share)
+        ]
+        return join_hits(list(self._threads.map(cast_share, *zip(*shares, strict=True))))

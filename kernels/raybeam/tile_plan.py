@@ -22,6 +22,8 @@ _MAX_LANES = 1 << 20
 # Rings are not shifted in scans with fewer firings than this multiple of the largest shift, because
 # too many tiles would be incomplete.
 _FEW_FIRINGS = 4
+# Casting smaller images one by one would take longer than casting a few tiles with rays of two.
+_MIN_IMAGE_RAYS = 1024
 
 
 class TilePlan(NamedTuple):
@@ -52,6 +54,17 @@ class TilePlan(NamedTuple):
         return self.lanes.shape[1]
 
 
+def image_rays(scan: Scan, firing: int) -> int:
+    """Return the rays per image if the scan consists of several large images, otherwise 0.
+
+    All rays of an image have the same pose. The poses of images can be far apart, whereas a moving
+    lidar has a pose for each firing. A tile with rays of two images would test all triangles
+    between them.
+    """
+    rays = scan.poses.rays_per_pose
+    return rays if max(firing, _MIN_IMAGE_RAYS) < rays < len(scan) else 0
+
+
 def plan_consecutive(subrays: int) -> TilePlan:
     """Create a plan in which each tile consists of consecutive beams with all of their sub-rays."""
     beams = np.arange(SUBTILES * VECTOR_RAYS)
@@ -78,7 +91,8 @@ def plan_tiles(scan: Scan) -> TilePlan:
     step = scan.pattern.step
     firing = step * subrays
     start = -scan.first % firing  # first ray of the first complete firing
-    whole_firings = (len(scan) - start) // firing
+    rays = image_rays(scan, firing) or len(scan)
+    whole_firings = (rays - start) // firing
     if step == 1 or whole_firings < 2 or firing * SUBTILES * VECTOR_RAYS > _MAX_LANES:
         return plan_consecutive(subrays)
     start += (whole_firings - 2) // 2 * firing

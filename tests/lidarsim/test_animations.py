@@ -418,7 +418,7 @@ def test_the_person_of_the_examples_walks_without_sliding(walker):
 def test_copies_share_their_poses_and_backends_agree(walker):
     ways = [Track([0, 1], [[x, y, 0], [x, y + 1.4, 0]]) for x, y in ((4, 0), (-5, 2), (3, -6))]
     actors = [Actor(replace(walker, name=f"W{k}"), way, k / 3) for k, way in enumerate(ways)]
-    meshes, which = distinct_meshes(actors)
+    meshes, which = distinct_meshes(actor.mesh for actor in actors)
     assert len(meshes) == 1 and which.tolist() == [0, 0, 0]
     scene = Scene.from_meshes([FLOOR]).with_actors(actors)
     survey = Survey(Sensor.grid(500, 24), [(0, 0, 1)], steps=36, keep_every=1,

@@ -364,3 +364,132 @@ def test_wrong_models_and_states():
     state.body_q.values[2, 0] = np.nan
     with pytest.raises(LidarError, match=r"pose of body 2 \('crate'\) is not finite"):
         scanner.ranges(state)
+
+
+@pytest.fixture(scope="module")
+def newton() -> Any:
+    """Newton, which compiles its kernels for a minute at first: pip install newton."""
+    newton = pytest.importorskip("newton", reason="Newton is not installed: pip install newton")
+    import warp
+
+    warp.config.quiet = True
+    return newton
+
+
+def real_shapes(newton, builder):
+    """Add bodies with all shapes of Newton, and return the number of bodies."""
+    import warp
+
+    slope = np.add.outer(np.arange(4.0), np.arange(5.0))  # its diagonals do not matter
+    field = newton.Heightfield(slope / 4, 4, 5, hx=1.0, hy=0.8)
+    wedge = newton.Mesh(tetrahedron().vertices, tetrahedron().indices)
+    builder.add_ground_plane(height=-2)
+    builder.add_shape_plane(xform=transform((0, 0, 2), 0, 170), width=8, length=14)
+    builder.add_shape_heightfield(
+        xform=transform((-4, -3, -1), 20, 10), heightfield=field, scale=(1, 1.5, 0.7)
+    )
+    kinds = [
+        lambda body, **to: builder.add_shape_sphere(body, radius=0.5, **to),
+        lambda body, **to: builder.add_shape_capsule(body, radius=0.3, half_height=0.4, **to),
+        lambda body, **to: builder.add_shape_cylinder(body, radius=0.4, half_height=0.5, **to),
+        lambda body, **to: builder.add_shape_cylinder(
+            body, radius=0.3, half_height=0.5, barrel_radius=1.0, **to
+        ),
+        lambda body, **to: builder.add_shape_cone(body, radius=0.4, half_height=0.6, **to),
+        lambda body, **to: builder.add_shape_ellipsoid(body, rx=0.3, ry=0.5, rz=0.7, **to),
+        lambda body, **to: builder.add_shape_box(body, hx=0.3, hy=0.4, hz=0.5, **to),
+        lambda body, **to: builder.add_shape_mesh(body, mesh=wedge, scale=(1, -2, 0.5), **to),
+        lambda body, **to: builder.add_shape_convex_hull(body, mesh=wedge, **to),
+    ]
+    for number, add in enumerate(kinds):
+        angle = np.radians(35 * number)
+        at = transform((4 * np.cos(angle), 4 * np.sin(angle), 0.3), 50 * number, 25)
+        body = builder.add_body(xform=warp.transform(*at), label=f"body {number}")
+        add(body, xform=warp.transform(*transform((0.2, 0.1, -0.1), 20, 30)))
+    lidar = builder.add_body(label="lidar")
+    builder.add_shape_box(lidar, hx=1, hy=1, hz=1)
+    return len(kinds)
+
+
+@pytest.mark.slow
+def test_ranges_are_those_of_newtons_own_rays(newton):
+    import warp
+
+    builder = newton.ModelBuilder()
+    kinds = real_shapes(newton, builder)
+    model = builder.finalize(device="cpu")
+    state = model.state()
+    scanner = NewtonScanner(model, GRID, body="lidar", objects="shape")
+    ranges = scanner.ranges(state)[0].reshape(-1)
+    (cloud,) = scanner.sweep(state)
+    assert len(np.unique(cloud.object)) == kinds + 3
+    directions = GRID.directions(np.arange(360)).reshape(-1, 3).astype(np.float32)
+    hidden = model.shape_label[-1]
+    is_hidden = np.array([label == hidden for label in model.shape_label])
+    flags = model.shape_flags.numpy()
+    flags[is_hidden] = 0
+    model.shape_flags.assign(flags)
+    model.bvh_build_shapes(state)
+    count = len(directions)
+    distance = warp.zeros(count, dtype=float)
+    normal = warp.zeros(count, dtype=warp.vec3)
+    newton.intersect_ray(
+        model,
+        ray_origins=warp.zeros(count, dtype=warp.vec3),
+        ray_directions=warp.array(directions, dtype=warp.vec3),
+        ray_worlds=warp.full(count, -1, dtype=warp.int32),
+        out_dist=distance,
+        out_normal=normal,
+        fast_math=False,
+    )
+    expected = distance.numpy().astype(np.float64)
+    expected[(expected < 0) | (expected > GRID.max_range_m)] = np.inf
+    assert (np.isfinite(ranges) != np.isfinite(expected)).mean() < 1e-3
+    both = np.isfinite(ranges) & np.isfinite(expected)
+    cosines = np.abs((normal.numpy() * directions).sum(axis=1))
+    error = np.abs(ranges[both] - expected[both]) * cosines[both]
+    assert both.sum() > 8000
+    assert (error > 1e-3).mean() < 3e-3  # at rims, where one of the two meets what is behind
+    assert np.quantile(error, 0.99) < 6e-4
+
+
+@pytest.mark.slow
+def test_boxes_fall_as_newton_lets_them(newton):
+    """Three worlds with boxes at different heights, against free fall."""
+    world = newton.ModelBuilder()
+    crate = world.add_body(label="crate")
+    world.add_shape_box(crate, hx=0.5, hy=0.5, hz=0.5)
+    world.add_site(-1, label="lidar")
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane(height=-1)
+    builder.replicate(world, 3)
+    model = builder.finalize(device="cpu")
+    states = model.state(), model.state()
+    heights = np.array([0.4, 0.6, 0.8])
+    poses = states[0].body_q.numpy()
+    poses[:, :3] = np.stack([[3.0, 3, 3], [0, 0, 0], heights], axis=1)
+    states[0].body_q.assign(poses)
+    solver = newton.solvers.SolverXPBD(model)
+    scanner = NewtonScanner(
+        model, load_sensor("velodyne/vlp16"), site="lidar", columns=["time"], precision_m=1e-5
+    )
+    assert scanner.worlds == (0, 1, 2)
+    assert scanner.names[0] == ("ground_plane", "crate")
+    step_s = 1 / 500
+    clouds: list[Any] = [[], [], []]
+    for step in range(60):
+        for sweeps, completed in zip(clouds, scanner.step(step * step_s, states[0]), strict=True):
+            sweeps += completed
+        states[0].clear_forces()
+        solver.step(states[0], states[1], None, None, step_s)
+        states = states[::-1]
+    for (cloud,), height in zip(clouds, heights, strict=True):
+        x, _, z = cloud.positions[cloud.object == 1].T
+        seconds = cloud.time[cloud.object == 1] / 1e9
+        middle = height - 9.81 * seconds * (seconds + step_s) / 2  # of semi-implicit steps
+        front = np.abs(x - 2.5) < 1e-4
+        assert front.sum() > 100 and (np.abs(z - middle)[front] < 0.501).all()
+        below = ~front & (z < middle)
+        assert np.abs(z - middle + 0.5)[below].max(initial=0) < 1e-4
+    below = [(c.object == 1) & (c.positions[:, 0] > 2.501) for (c,) in clouds]
+    assert sum(rows.sum() for rows in below) > 20

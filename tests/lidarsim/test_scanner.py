@@ -240,6 +240,17 @@ def test_without_a_number_only_the_random_numbers_advance(scene, sensor):
     assert len({image.tobytes() for image in images}) == 4
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_images_from_several_poses_are_those_from_each(threads):
+    """Also where the rays of two images, far apart, would share a tile."""
+    scanner = Scanner(Scene.seed(), VLP16, backend="tiles", threads=threads)
+    poses = [Pose((0, 0, 1)), Pose((30, -25, 2), 180), Pose((-15, 20, 0.5), 77, 3)]
+    images = scanner.ranges(poses)
+    assert np.isfinite(images).mean(axis=(1, 2)).min() > 0.02
+    for pose, image in zip(poses, images, strict=True):
+        assert np.array_equal(scanner.ranges(pose)[0], image)
+
+
 def test_streams_are_independent(scene):
     given = {"columns": COLUMNS, "backend": "numpy"}
     before = Scanner(scene, GRID, **given).sweep(BEND, number=3)

@@ -265,7 +265,7 @@ class PictureContent:
     def _mesh_arrays(self) -> dict[str, Any]:
         """Return the meshes of actors and their animations as named arrays."""
         arrays: dict[str, Any] = {}
-        meshes, arrays["actor_mesh"] = distinct_meshes(self.scene.actors)
+        meshes, arrays["actor_mesh"] = distinct_meshes(actor.mesh for actor in self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colors is not None:

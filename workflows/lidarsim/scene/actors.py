@@ -249,28 +249,30 @@ def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
     return max(20, min(max_samples, MAX_SAMPLES // max(len(actors), 1)))
 
 
-def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
-    """Return the distinct meshes of the actors and the mesh index of each actor.
+def distinct_meshes(meshes: Iterable[SceneMesh]) -> tuple[list[SceneMesh], Indices]:
+    """Return the distinct meshes, and the index of the distinct mesh for each mesh.
 
-    Two meshes are the same if they share their arrays. Pickling preserves this.
+    Two meshes are the same if they share their arrays, even if their names differ. Pickling
+    preserves this.
     """
     mesh_indices: dict[tuple[int, ...], int] = {}  # {ids of the arrays: index of the mesh}
-    meshes: list[SceneMesh] = []
+    distinct: list[SceneMesh] = []
     indices = []
-    for mesh in (actor.mesh for actor in actors):
+    for mesh in meshes:
         arrays = (
             mesh.vertices,
             mesh.faces,
             mesh.colors,
+            mesh.voxels,
             mesh.materials,
             mesh.animation,
             *mesh.cutouts,
         )
-        index = mesh_indices.setdefault(tuple(map(id, arrays)), len(meshes))
-        if index == len(meshes):
-            meshes.append(mesh)
+        index = mesh_indices.setdefault(tuple(map(id, arrays)), len(distinct))
+        if index == len(distinct):
+            distinct.append(mesh)
         indices.append(index)
-    return meshes, np.array(indices, np.intp)
+    return distinct, np.array(indices, np.intp)
 
 
 def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:

@@ -82,7 +82,7 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
         rays = (sensor.period or 0) * sensor.channels
         patterns += PATTERN_RAY * min(rays, PATTERN_RAYS)
     poses = 0
-    meshes, _ = distinct_meshes(scene.actors)
+    meshes, _ = distinct_meshes(actor.mesh for actor in scene.actors)
     for mesh in meshes:
         if mesh.animation is not None:
             vertices = mesh.animation.vertices

@@ -19,7 +19,7 @@ from ..columns.cloud import Cloud
 from ..errors import LidarError
 from ..motion.trajectory import StaticPose, Track
 from ..numerics.arrays import Floats, Floats32
-from ..scene.actors import Actor
+from ..scene.actors import Actor, distinct_meshes
 from ..scene.object_names import unique_names
 from ..scene.scene import Scene
 from ..scene.scene_instances import SceneInstance
@@ -134,7 +134,11 @@ class Follower:
         self._bodies = list(bodies)
         self._sensor = sensor
         self._options = options
-        instances = [SceneInstance(mesh, np.eye(4), mesh.name) for mesh in bodies]
+        distinct, indices = distinct_meshes(bodies)
+        instances = [
+            SceneInstance(distinct[index], np.eye(4), mesh.name)
+            for index, mesh in zip(indices, bodies, strict=True)
+        ]
         # Scanner of a world that is stationary during each sweep.
         self._frozen = Scanner(Scene.from_meshes([*static, *instances]), sensor, **options)
         self._matrices = np.tile(np.eye(4), (len(bodies), 1, 1))

@@ -397,7 +397,7 @@ class View:
         v, 3) of each pose. Its actors have the fractional pose number at each time
         (``actor0_frames``). Coordinates are local, and times are in seconds.
         """
-        meshes, mesh_indices = distinct_meshes(self.actors)
+        meshes, mesh_indices = distinct_meshes(actor.mesh for actor in self.actors)
         arrays: dict[str, AnyArray] = {
             "actor_mesh": mesh_indices.astype(np.int32)
         }  # browsers lack int64 arrays

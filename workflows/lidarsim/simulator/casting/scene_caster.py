@@ -482,7 +482,7 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     """
     if not actors:
         return None
-    meshes, shape = distinct_meshes(actors)
+    meshes, shape = distinct_meshes(actor.mesh for actor in actors)
     parts_of_meshes = [[*split_by_masks(mesh)] for mesh in meshes]
     part_triangles = np.zeros((len(meshes), max(map(len, parts_of_meshes))), np.int32)
     for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):

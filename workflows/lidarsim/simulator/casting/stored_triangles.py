@@ -39,7 +39,7 @@ class StoredTriangles:
         # First triangle of each instance, followed by the first triangle of the actors.
         self.instance_starts = face_count + np.cumsum([0, *instance_sizes])
         actor_sizes = [len(actor.mesh.faces) for actor in scene.actors]
-        self.meshes, self.actor_mesh = distinct_meshes(scene.actors)
+        self.meshes, self.actor_mesh = distinct_meshes(actor.mesh for actor in scene.actors)
         mesh_sizes = [len(mesh.faces) for mesh in self.meshes]
         self.mesh_starts = mesh_starts = face_count + np.cumsum([0, *mesh_sizes])
         actor_starts = self.instance_starts[-1] + np.cumsum([0, *actor_sizes])[:-1]
