@@ -20,7 +20,17 @@ import numpy as np
 Result = TypeVar("Result")
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
-_PACKAGES = ("numpy", "numba", "dask", "open3d", "open3d-cpu", "trimesh", "mujoco", "warp-lang")
+_PACKAGES = (
+    "numpy",
+    "numba",
+    "dask",
+    "open3d",
+    "open3d-cpu",
+    "trimesh",
+    "mujoco",
+    "newton",
+    "warp-lang",
+)
 
 
 def argument_parser(

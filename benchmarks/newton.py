@@ -14,7 +14,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
@@ -90,65 +90,67 @@ class NewtonRays:
         newton.intersect_ray(self.model, **self.given)
 
 
+class Created(NamedTuple):
+    """A scanner, or several, and what their creation took."""
+
+    scanners: list[NewtonScanner]
+    seconds: float  # CPU time
+    mebibytes: float
+
+
+def create(model: Any, choices: list[dict[str, Any]]) -> Created:
+    """Create a scanner for each choice of lidars."""
+    sensor = load_sensor("velodyne/vlp16")
+    process = psutil.Process()
+    before = process.memory_info().rss
+
+    def make() -> list[NewtonScanner]:
+        return [
+            NewtonScanner(model, sensor, columns=["range"], threads=1, **choice)
+            for choice in choices
+        ]
+
+    seconds, scanners = time_call(make)
+    return Created(scanners, seconds, (process.memory_info().rss - before) / 2**20)
+
+
 def measure(worlds: int, repeat: int) -> dict[str, Any]:
     """Measure a scan of all worlds."""
     import warp
 
     warp.config.quiet = True
-    sensor = load_sensor("velodyne/vlp16")
-    process = psutil.Process()
-    model = build(worlds, 0)
-    options: dict[str, Any] = {"columns": ["range"], "threads": 1}
-    memory: dict[str, float] = {}
-    building: dict[str, float] = {}
-
-    def create(name: str, make: Any) -> Any:
-        before = process.memory_info().rss
-        building[name], made = time_call(make)
-        memory[name] = (process.memory_info().rss - before) / 2**20
-        return made
-
-    NewtonScanner(model, sensor, body=[0], **options).ranges(model.state())  # compiles the loops
-    shared = create("one scanner", lambda: NewtonScanner(model, sensor, site="lidar", **options))
-    bodies = [k for k, label in enumerate(model.body_label) if label == "trunk"]
-    alone = create(
-        "separate scanners",
-        lambda: [NewtonScanner(model, sensor, body=[body], **options) for body in bodies],
-    )
-    spread = build(worlds, SPACING_M)
-    everything = create(
-        "all worlds visible",
-        lambda: NewtonScanner(spread, sensor, site="lidar", worlds="all", **options),
-    )
-    directions = sensor.directions(np.arange(shared.ranges(model.state()).shape[1]))
-    rays = NewtonRays(model, directions.reshape(-1, 3))
-    rng = np.random.default_rng(1)
-    state, spread_state = model.state(), spread.state()
-
-    def move(moving: Any) -> Any:
-        poses = moving.body_q.numpy()
-        poses[:, :2] += rng.uniform(-0.001, 0.001, (len(poses), 2))
-        return moving
-
-    calls = {
-        "one scanner": lambda: shared.ranges(move(state)),
-        "separate scanners": lambda: [scanner.ranges(move(state)) for scanner in alone],
-        "all worlds visible": lambda: everything.ranges(move(spread_state)),
-        "one scanner, sweep": lambda: shared.sweep(move(state)),
-        "Newton's rays": lambda: rays.cast(move(state)),
+    models = build(worlds, 0), build(worlds, SPACING_M)
+    states = models[0].state(), models[1].state()
+    create(models[0], [{"body": 0}]).scanners[0].ranges(states[0])  # compiles the loops
+    bodies = [k for k, label in enumerate(models[0].body_label) if label == "trunk"]
+    created = {
+        "one scanner": create(models[0], [{"site": "lidar"}]),
+        "separate scanners": create(models[0], [{"body": body} for body in bodies]),
+        "all worlds visible": create(models[1], [{"site": "lidar", "worlds": "all"}]),
     }
+    (single,) = created["one scanner"].scanners
+    firings = single.ranges(states[0]).shape[1]
+    directions = load_sensor("velodyne/vlp16").directions(np.arange(firings)).reshape(-1, 3)
+    rays = NewtonRays(models[0], directions)
+    rng = np.random.default_rng(1)
 
     def cpu_s(name: str, _: int) -> float:
-        seconds, _result = time_call(calls[name])
-        return seconds
+        state = states[name == "all worlds visible"]
+        poses = state.body_q.numpy()
+        poses[:, :2] += rng.uniform(-0.001, 0.001, (len(poses), 2))
+        if name == "Newton's rays":
+            return time_call(lambda: rays.cast(state))[0]
+        if name == "one scanner, sweep":
+            return time_call(lambda: single.sweep(state))[0]
+        return time_call(lambda: [item.ranges(state) for item in created[name].scanners])[0]
 
-    seconds = run_rounds({name: partial(cpu_s, name) for name in calls}, repeat)
+    names = [*created, "one scanner, sweep", "Newton's rays"]
     return {
         "worlds": worlds,
-        "rays": worlds * len(directions.reshape(-1, 3)),
-        "seconds": seconds,
-        "building_s": building,
-        "memory_mib": memory,
+        "rays": worlds * len(directions),
+        "seconds": run_rounds({name: partial(cpu_s, name) for name in names}, repeat),
+        "building_s": {name: item.seconds for name, item in created.items()},
+        "memory_mib": {name: item.mebibytes for name, item in created.items()},
     }
 
 

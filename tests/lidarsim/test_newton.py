@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import runpy
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -493,3 +496,14 @@ def test_boxes_fall_as_newton_lets_them(newton):
         assert np.abs(z - middle + 0.5)[below].max(initial=0) < 1e-4
     below = [(c.object == 1) & (c.positions[:, 0] > 2.501) for (c,) in clouds]
     assert sum(rows.sum() for rows in below) > 20
+
+
+@pytest.mark.slow
+def test_the_example_scans_falling_boxes(newton, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    example = Path(__file__).parents[2] / "examples" / "newton_lidar.py"
+    runpy.run_path(str(example), run_name="__main__")
+    lines = re.findall(r"s, world (\d): 1[45],.* points, (.*) on boxes", capsys.readouterr().out)
+    assert [int(world) for world, _ in lines] == [*range(8)] * 5
+    assert all(int(count.replace(",", "")) > 500 for _, count in lines)
+    assert (tmp_path / "boxes.ply").exists()

@@ -150,6 +150,8 @@ def test_python_runs(tmp_path, block, in_threads, capsys, monkeypatch):
         pytest.importorskip("foxglove", reason="needs foxglove-sdk: the extra live")
     if "import mujoco" in block.code:
         pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
+    if "import newton" in block.code:
+        pytest.importorskip("newton", reason="Newton is not installed: pip install newton")
     folder = tmp_path / "lidarpool-out"
     folder.mkdir()
     one = np.ones(1, np.int32)
