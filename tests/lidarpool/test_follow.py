@@ -5,6 +5,7 @@ Most tests pass messages to the node directly. Tests of the command skip without
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -480,6 +481,21 @@ def test_a_model_topic_and_a_flood_of_poses(folder):
     x, y, z = loop.clouds()[-1].points.T
     front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
     assert np.allclose(x[front], 1.5, atol=0.002) and front.sum() > 200
+
+
+def test_poses_that_arrive_too_fast_are_skipped(folder):
+    """The last message of a topic is read, and so are all static poses."""
+    flood = [("robot", "room", (0, 0, 0.2), 0.0)] + [
+        (f"camera {k}", "robot", (0, 0, 0.01 * k), 0.0) for k in range(400)
+    ]
+    with Loop("room.sdf") as loop:
+        loop.send(*[transforms(1 + k / 1000, flood) for k in range(60)], clock(1.1))
+        loop.send(transforms(0, [("mast", "robot", (0, 0, 1), 0.0)], "/tf_static"))
+        loop.node.step()
+        assert loop.node._poses.last_ns == 1_059_000_000
+        assert "mast" in loop.node._tree.received
+        (note,) = notes_of(loop, "faster than they can be read")
+    assert re.search(r"so \d+ messages on /tf were skipped", note)
 
 
 @pytest.mark.parametrize(

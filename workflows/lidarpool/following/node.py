@@ -27,6 +27,7 @@ _QUIET_S = 5.0  # time without a clock message after which a notice is shown
 _CHECK_NS = 50_000_000  # simulation time between checks of bodies and frames
 _NEVER_NS = 2**63 - 1  # later than any time
 _POLL_S = 0.05
+_MAX_READ_S = 0.1  # time for reading poses, after which all but the last of a topic are skipped
 _MAX_DELAYS = 10_000  # delays that are kept for the summary
 
 
@@ -170,10 +171,7 @@ class FollowNode:
         bool
             Whether a sweep was due.
         """
-        for message in self._subscriber.receive(wait_s):
-            time_ns = self._poses.read(message)
-            if time_ns is not None:
-                self._set_clock(time_ns)
+        self._read_messages(wait_s)
         self._check_publishers()
         clock_ns = self._poses.clock_ns
         if clock_ns is None:
@@ -191,6 +189,35 @@ class FollowNode:
         if sensor is not None:
             self._simulate(sensor)
         return sensor is not None
+
+    def _read_messages(self, wait_s: float) -> None:
+        """Read the clock and the poses that have arrived.
+
+        If poses arrive faster than they can be read, some are skipped. Otherwise, the clock and the
+        sweeps would fall behind without limit.
+        """
+        begin_s: float | None = None  # when the first message was read, which is after the wait
+        skipped: dict[str, RosMessage] = {}  # {topic: its last message that was not read}
+        count = 0
+        for message in self._subscriber.receive(wait_s):
+            begin_s = begin_s or time.monotonic()
+            is_needed = message.topic == CLOCK_TOPIC or message.topic.endswith("_static")
+            if not is_needed and time.monotonic() - begin_s > _MAX_READ_S:
+                count += message.topic in skipped
+                skipped[message.topic] = message
+                continue
+            time_ns = self._poses.read(message)
+            if time_ns is not None:
+                self._set_clock(time_ns)
+        for message in skipped.values():
+            self._poses.read(message)
+        if count:
+            self._notices.show_event(
+                "flood",
+                f"Poses arrive faster than they can be read, so {plural(count, 'message')} on "
+                f"{list_names([*skipped], MAX_NAMES)} were skipped. Publish fewer frames, or "
+                "reduce the rate.",
+            )
 
     def _set_clock(self, time_ns: int) -> None:
         """Set the simulation time. The sweeps are restarted if it has jumped."""
