@@ -265,3 +265,12 @@ def test_the_command_selects_the_form_by_extension(room, tmp_path):
         cli, ["fit", "--pattern", str(table), "--out", model, "--pose", "0,0,1"]
     )
     assert "--pose cannot be combined with --pattern" in refused.output
+
+
+@pytest.mark.extended
+def test_sweeps_without_timestamps_follow_each_other(room):
+    """Their period is a firing longer than their times. The pattern of a Mid-360 repeats late."""
+    recording = record(room, load_sensor("livox/mid360"), 3, are_stamped=False)
+    fitted = fit_pattern(recording, as_rays=True)
+    (note,) = [note for note in fitted.figures["notes"] if "without a return" in note]
+    assert "does not repeat within 0.3 s. 0 pulses without a return" in note

@@ -120,7 +120,7 @@ class PatternReturns:
             notes.append(f"the first {len(sweeps):,} of {len(recording):,} sweeps are used")
         points = np.concatenate([sweep.points for sweep in sweeps])
         ring, elevation_rad = _rings(recording, sweeps, points)
-        sweep_times = _sweep_times(recording, len(sweeps))
+        sweep_times = _sweep_times(recording, sweeps)
         return cls(
             recording.name,
             points,
@@ -202,14 +202,21 @@ def _channels(sweeps: Sequence[Sweep]) -> Ints:
     )
 
 
-def _sweep_times(recording: Recording, count: int) -> SweepTimes:
+def _sweep_times(recording: Recording, sweeps: Sequence[Sweep]) -> SweepTimes:
+    count = len(sweeps)
     stamps_ns = recording.stamps_ns
     times = recording.point_times
     if stamps_ns is not None and count > 1 and (np.diff(stamps_ns[:count]) > 0).all():
         starts_s = np.asarray(1e-9 * (stamps_ns[:count] - stamps_ns[0]), np.float64)
         return SweepTimes(starts_s, True, float(np.median(np.diff(starts_s))))
-    period_s = _SWEEP_S if times is None else times.sweep_s
+    period_s = _SWEEP_S if times is None else times.sweep_s + _firing_interval_s(sweeps[0])
     return SweepTimes(np.asarray(period_s * np.arange(count)), False, period_s)
+
+
+def _firing_interval_s(sweep: Sweep) -> float:
+    """Return the time from the last firing of a sweep to the first of the next one, in seconds."""
+    intervals_s = np.diff(np.unique(np.asarray([] if sweep.times_s is None else sweep.times_s)))
+    return float(np.median(intervals_s)) if len(intervals_s) else 0.0
 
 
 def _times_s(sweeps: Sequence[Sweep], sweep_times: SweepTimes) -> Floats | None:
