@@ -296,6 +296,11 @@ def test_what_is_no_address_is_refused(text):
         Address.choose(text, 8765)
 
 
+def test_a_port_alone_is_not_an_address():
+    with pytest.raises(LidarError, match=r"'50051' is not a valid .* write 127\.0\.0\.1:50051\."):
+        Address.choose("50051", 8765)
+
+
 def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
     with pytest.raises(
         LidarError, match=r"is not a valid address\. Expected ADDRESS:PORT"

@@ -146,6 +146,11 @@ class Address(NamedTuple):
 
     @classmethod
     def _parse(cls, text: str, port: int) -> Address:
+        if text.isdecimal():  # The operating system would accept this as an address.
+            raise LidarError(
+                f"{shorten_name(text, _SHOWN_LETTERS)!r} is not a valid address. If it is a port, "
+                f"write {LOOPBACK}:{shorten_name(text, _SHOWN_LETTERS)}."
+            )
         has_port = ":" in text and not text.endswith("]")  # [::1] is an IPv6 address
         host, _, digits = text.rpartition(":") if has_port else (text, "", "")
         number = port_number(digits) if digits else port
