@@ -41,6 +41,7 @@ from .first_step import print_first_step
 from .flight_command import flight
 from .follow_command import follow
 from .mount_command import mount
+from .occupancy_command import occupancy
 from .play_command import play
 from .result_commands import export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
@@ -234,7 +235,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations, flight, mount),
-        *(view, play, follow, serve, plot, export, compare, fit, twin, augment),
+        *(view, play, follow, serve, plot, export, compare, fit, twin, augment, occupancy),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

@@ -101,7 +101,7 @@ class KITTI(MultiFileFormat):
                 f"KITTI labels support at most {MAX_INSTANCES:,} objects. Write another format."
             )
         super().__init__(cloud, sweeps, entry)
-        self.names = _names(sweeps, entry)
+        self.names = sequence_names(sweeps, entry)
         self.sequences = [f"sequences/{name}" for name in self.names]
         kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
@@ -194,7 +194,7 @@ class KITTI(MultiFileFormat):
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the names of the point file and the label file."""
-        names = job.get_or_compute("sequences", lambda: _names(job.sweeps, job.entry))
+        names = job.get_or_compute("sequences", lambda: sequence_names(job.sweeps, job.entry))
         folder = f"sequences/{names[job.sweeps.sensor[sweep]]}"
         number = f"{job.sweeps.numbers[sweep]:06}"
         return [f"{folder}/velodyne/{number}.bin", f"{folder}/labels/{number}.label"]
@@ -259,7 +259,7 @@ def flow_arrays(points: Floats32, flow: Floats32, camera: Floats) -> dict[str, F
     }
 
 
-def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
+def sequence_names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     """Return the name of each sensor's sequence."""
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]

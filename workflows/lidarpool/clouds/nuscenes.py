@@ -262,6 +262,13 @@ class NuScenes(MultiFileFormat):
         return table[np.frombuffer(read(name), np.uint8)].tobytes()
 
 
+def sample_tokens(sweeps: Sweeps, entry: Entry | None = None) -> tuple[str, list[str]]:
+    """Return the name of the scene, and the token of each sample, as in the written tables."""
+    tables = _Tables(sweeps, entry)
+    count = int((sweeps.sensor == 0).sum())
+    return tables.scene, [tables.token("sample", number) for number in range(count)]
+
+
 def _channels(sweeps: Sweeps) -> list[str]:
     """Return the nuScenes channel name of each sensor."""
     return make_identifiers([FIRST_SENSOR, *(name or FIRST_SENSOR for name in sweeps.sensors[1:])])
@@ -400,23 +407,24 @@ class _Tables:
     def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
         self.sweeps = sweeps
         self._entry = entry
-        self._scene = _SCENE if entry is None else entry.name
+        self.scene = _SCENE if entry is None else entry.name
         self._salt = f"{'' if entry is None else f'{entry.name} '}{fingerprint(sweeps)}"
         self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}
         self._add("log", _LOG, logfile="", vehicle="", date_captured=_DATE, location="")
-        logs = [self._token("log", _LOG)]
+        logs = [self.token("log", _LOG)]
         self._add("map", _MAP, category="semantic_prior", filename=_MAP, log_tokens=logs)
 
-    def _token(self, table: str, key: object) -> str:
+    def token(self, table: str, key: object) -> str:
+        """Return the token of a row."""
         salt = self._salt if self._entry is None or table not in _SHARED else ""
         return md5(f"{salt} {table} {key}".encode(), usedforsecurity=False).hexdigest()
 
     def _add(self, table: str, key: object, **fields: Any) -> None:
-        self.rows.setdefault(table, []).append({"token": self._token(table, key), **fields})
+        self.rows.setdefault(table, []).append({"token": self.token(table, key), **fields})
 
     def _chain(self, table: str, keys: list[Any]) -> list[dict[str, str]]:
         """Return the fields `prev` and `next` for each row in a sequence."""
-        tokens = ["", *(self._token(table, key) for key in keys), ""]
+        tokens = ["", *(self.token(table, key) for key in keys), ""]
         return [{"prev": a, "next": b} for a, b in zip(tokens, tokens[2:], strict=False)]
 
     def add_frames(self, channels: list[str], sample: Any, names: list[str]) -> None:
@@ -425,26 +433,26 @@ class _Tables:
         count = int((sweeps.sensor == 0).sum())
         self._add(
             "scene",
-            self._scene,
-            name=self._scene,
+            self.scene,
+            name=self.scene,
             description=sweeps.frame_text(compensated=True),
             nbr_samples=count,
-            log_token=self._token("log", _LOG),
-            first_sample_token=self._token("sample", 0),
-            last_sample_token=self._token("sample", count - 1),
+            log_token=self.token("log", _LOG),
+            first_sample_token=self.token("sample", 0),
+            last_sample_token=self.token("sample", count - 1),
         )
         # nuscenes-devkit sorts scenes by time, and fails if two scenes have the same time.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
         for number, neighbors in enumerate(self._chain("sample", list(range(count)))):
-            scene = self._token("scene", self._scene)
+            scene = self.token("scene", self.scene)
             self._add("sample", number, timestamp=times[number], scene_token=scene, **neighbors)
         for sensor, channel in enumerate(channels):
             self._add("sensor", channel, channel=channel, modality="lidar")
             self._add(
                 "calibrated_sensor",
                 channel,
-                sensor_token=self._token("sensor", channel),
+                sensor_token=self.token("sensor", channel),
                 translation=[0.0] * 3,
                 rotation=[1.0, 0.0, 0.0, 0.0],
                 camera_intrinsic=[],
@@ -470,9 +478,9 @@ class _Tables:
                 self._add(
                     "sample_data",
                     sweep,
-                    sample_token=self._token("sample", number),
-                    ego_pose_token=self._token("ego_pose", sweep),
-                    calibrated_sensor_token=self._token("calibrated_sensor", channel),
+                    sample_token=self.token("sample", number),
+                    ego_pose_token=self.token("ego_pose", sweep),
+                    calibrated_sensor_token=self.token("calibrated_sensor", channel),
                     timestamp=timestamp,
                     fileformat="pcd",
                     height=0,
@@ -501,10 +509,10 @@ class _Tables:
             self._add(
                 "instance",
                 actor,
-                category_token=self._token("category", kind),
+                category_token=self.token("category", kind),
                 nbr_annotations=len(samples),
-                first_annotation_token=self._token("sample_annotation", annotation_keys[0]),
-                last_annotation_token=self._token("sample_annotation", annotation_keys[-1]),
+                first_annotation_token=self.token("sample_annotation", annotation_keys[0]),
+                last_annotation_token=self.token("sample_annotation", annotation_keys[-1]),
             )
             chain = self._chain("sample_annotation", annotation_keys)
             for number, beside in zip(samples, chain, strict=True):
@@ -515,8 +523,8 @@ class _Tables:
                 self._add(
                     "sample_annotation",
                     (actor, number),
-                    sample_token=self._token("sample", number),
-                    instance_token=self._token("instance", actor),
+                    sample_token=self.token("sample", number),
+                    instance_token=self.token("instance", actor),
                     visibility_token=_visibility_token(visibility),
                     attribute_tokens=[],
                     translation=at_stamp.centers[actor].tolist(),

@@ -12,7 +12,7 @@ from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor.optics import TWO_RETURNS
 from ..survey.survey import Survey
-from .casting.actor_visibility import CHUNK_RAYS as VISIBILITY_RAYS
+from .casting.ray_chunks import CHUNK_RAYS as VISIBILITY_RAYS
 from .casting.visibility import static_key, unseen_objects
 from .points.device_columns import needs_hits
 from .pulses import CHUNK_RAYS

@@ -23,6 +23,7 @@ from ..survey.survey import ScanSpec, Survey
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.actor_visibility import ActorVisibility
 from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
+from .casting.ray_chunks import ray_chunks
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
 from .casting.surfaces import SceneSurfaces
 from .points.batch_points import BatchPoints
@@ -44,6 +45,14 @@ class _Rays(NamedTuple):
     # True if the rays are one firing in the head frame, with a pose for each firing. Otherwise they
     # are in the platform frame.
     by_head: bool = False
+
+
+class CentralRays(NamedTuple):
+    """Central rays of n pulses in the scene frame, up to the first surface."""
+
+    origins: Floats  # (3, n), meters
+    directions: Floats  # (3, n), unit vectors
+    ranges: Floats  # (n,), meters; inf if there is no surface within the range of the sensor
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
@@ -252,21 +261,11 @@ class Rig:
         `tally` is set, the hits of each triangle are counted.
         """
         number = specs[0].sensor
-        repeated, by_head = self._rays_of_sensor(number, path.moves)
         sensor = self.survey.mounted_sensors[number].sensor
         channels = sensor.channels
         first = specs[0].firings[0]
-        stop = specs[-1].firings[1]
-        firings = Firings.from_scans(sensor, specs)
-        poses = self._poses(firings, path, late_ns, by_head=by_head)
-        self.scene_casters[number].ensure_trees(poses.positions)
-        if repeated is not None:
-            pattern = repeated
-            start = first * channels % len(repeated)  # pattern row of the first ray
-        else:
-            pattern = self.pattern(number, first, stop)
-            start = 0
-        window = (start, start + (stop - first) * channels)
+        firings, pattern, poses, window = self._rays_of_scans(specs, path, late_ns)
+        start = window[0]
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             points = self._device.returns(specs, pattern, poses, window, groups)
@@ -291,6 +290,47 @@ class Rig:
             poses=poses,
             actor_rays=self._actor_rays(specs, pattern, poses, window),
         )
+
+    def central_rays(self, first: int, stop: int) -> Iterator[CentralRays]:
+        """Cast the central rays of scans `first` to `stop`, which must share a sensor and station.
+
+        Effects such as noise, weather and faults do not apply. Pulses that the platform blocks are
+        omitted.
+        """
+        specs = [self.survey.scan(scan) for scan in range(first, stop)]
+        caster = self.scene_casters[specs[0].sensor]
+        sensor = self.survey.mounted_sensors[specs[0].sensor].sensor
+        _, pattern, poses, window = self._rays_of_scans(specs, self.survey.path, 0.0)
+        for chunk in ray_chunks(sensor, specs, pattern, poses, window):
+            hits = caster.scan(chunk.pattern, chunk.poses, **chunk.limits)
+            ranges = np.full(len(chunk.scan), np.inf)
+            ranges[hits.ray] = hits.distance
+            rays = chunk.computed_rays()[:, chunk.allowed]
+            yield CentralRays(rays[:3], rays[3:], ranges[chunk.allowed])
+
+    def _rays_of_scans(
+        self, specs: list[ScanSpec], path: Trajectory, late_ns: float
+    ) -> tuple[Firings, Pattern, CastPoses, tuple[int, int]]:
+        """Return the firings of consecutive scans, and their rays as rows of a pattern with poses.
+
+        The last value has the first row of the rays in the pattern, and one past the last.
+        """
+        number = specs[0].sensor
+        repeated, by_head = self._rays_of_sensor(number, path.moves)
+        sensor = self.survey.mounted_sensors[number].sensor
+        channels = sensor.channels
+        first = specs[0].firings[0]
+        stop = specs[-1].firings[1]
+        firings = Firings.from_scans(sensor, specs)
+        poses = self._poses(firings, path, late_ns, by_head=by_head)
+        self.scene_casters[number].ensure_trees(poses.positions)
+        if repeated is not None:
+            pattern = repeated
+            start = first * channels % len(repeated)  # pattern row of the first ray
+        else:
+            pattern = self.pattern(number, first, stop)
+            start = 0
+        return firings, pattern, poses, (start, start + (stop - first) * channels)
 
     def _actor_rays(
         self, specs: list[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]

@@ -7,15 +7,14 @@ in the full scene. Pulses that the platform blocks do not count.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from raybeam import Pattern
-from raybeam.scan import Scan, check_scan
 
 from ...columns.actor_rays import ACTOR_RAYS
 from ...motion.trajectory import full_poses, presence_ns
@@ -26,10 +25,10 @@ from ...scene.scene import Scene
 from ...sensor import Sensor
 from ...survey.survey import ScanSpec, Survey
 from .motion import CastPoses
+from .ray_chunks import RayChunk, ray_chunks
 from .scene_caster import NEVER_NS, SceneCaster
 from .stored_triangles import StoredTriangles
 
-CHUNK_RAYS = 1 << 17  # number of rays that are cast at a time
 _FIELD_RAYS = 1_000_000  # maximum number of rays from which a field of view is determined
 _CELLS = 8  # number of cells along each axis of a box, whose centers are in or out of the field
 # A gap between azimuths limits the field of view if it is this wide and at least twice as wide as
@@ -102,24 +101,6 @@ class _SweepRays:
         return cls(number, records, first, stop)
 
 
-@dataclass(frozen=True, eq=False)
-class _RayChunk:
-    """Consecutive rays, which are cast together."""
-
-    start: int  # number of the first ray, counted from the first scan
-    scan: Scan
-    pattern: Pattern
-    poses: CastPoses
-    limits: dict[str, Any]  # further arguments of `SceneCaster.scan`
-    allowed: Bools  # (n,), False for pulses that the platform blocks
-
-    def computed_rays(self) -> Floats:
-        """Compute the origins in meters and the directions of the rays, in shape (6, n)."""
-        self.scan.rays(0, len(self.scan))  # writes the rays to `out`
-        assert self.scan.out is not None
-        return self.scan.out
-
-
 class _Boxes(NamedTuple):
     """Boxes of k actors in the scene frame."""
 
@@ -165,31 +146,12 @@ class ActorVisibility:
             _SweepRays.empty(sweep, self._first_sweep + sweep, self._present_actors(sweep), *span)
             for sweep, *span in self._sweeps_of(specs, window[1] - window[0])
         ]
-        for chunk in self._chunks(specs, pattern, poses, window):
+        for chunk in ray_chunks(self._sensor, specs, pattern, poses, window):
             self._count_visible(sweeps, chunk)
             self._count_alone(sweeps, chunk)
         for sweep in sweeps:
-            self._measure_boxes(sweep, self._chunks(specs, pattern, poses, window))
+            self._measure_boxes(sweep, ray_chunks(self._sensor, specs, pattern, poses, window))
         return np.concatenate([sweep.records for sweep in sweeps])
-
-    def _chunks(
-        self, specs: Sequence[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]
-    ) -> Iterator[_RayChunk]:
-        """Yield the rays of scans in chunks, which limits the memory."""
-        first, stop = window
-        step = max(1, CHUNK_RAYS // (poses.rays_per_pose or 1)) * (poses.rays_per_pose or 1)
-        for start in range(0, stop - first, step):
-            count = min(step, stop - first - start)
-            limits: dict[str, Any] = {
-                "window": (first + start, first + start + count),
-                "t_min": self._sensor.min_range_m,
-                "t_max": self._sensor.max_range_m,
-                "out": np.empty((6, count)),  # rays, which are computed only once
-            }
-            chunk_poses = poses.for_subrays(start, start + count, 1)
-            scan = check_scan(pattern, **chunk_poses.caster_arguments, **limits)
-            allowed = ~self._is_blocked(specs, start, count)
-            yield _RayChunk(start, scan, pattern, chunk_poses, limits, allowed)
 
     @cached_property
     def _first_sweep(self) -> int:
@@ -206,14 +168,6 @@ class ActorVisibility:
         if self._caster.unseen is not None:
             presence[self._caster.unseen[len(self._scene.names) :]] = NEVER_NS
         return presence
-
-    def _is_blocked(self, specs: Sequence[ScanSpec], start: int, count: int) -> Bools:
-        """Return whether the platform blocks each of `count` rays from ray `start` on."""
-        if not len(self._sensor.beams.blocked):
-            return np.zeros(count, np.bool_)
-        rays = np.arange(start, start + count, dtype=np.int64)
-        firing, channel = np.divmod(rays, self._sensor.channels)
-        return self._sensor.is_blocked(specs[0].firings[0] + firing, channel)
 
     def _sweeps_of(self, specs: Sequence[ScanSpec], count: int) -> list[tuple[int, int, int]]:
         """Return the sweeps of scans, each with its first ray and the end of its rays."""
@@ -232,7 +186,7 @@ class ActorVisibility:
         present = (appears <= stops_ns[sweep]) & (starts_ns[sweep] <= leaves)
         return np.flatnonzero(present)
 
-    def _count_visible(self, sweeps: Sequence[_SweepRays], chunk: _RayChunk) -> None:
+    def _count_visible(self, sweeps: Sequence[_SweepRays], chunk: RayChunk) -> None:
         """Add the number of rays that hit each actor first."""
         hits = self._caster.scan(chunk.pattern, chunk.poses, **chunk.limits)
         actors = self._triangles.objects(hits.triangle) - self._triangles.static_objects
@@ -245,7 +199,7 @@ class ActorVisibility:
             counts = np.bincount(actors[in_sweep], minlength=len(self._scene.actors))
             sweep.records["visible"] += counts[sweep.records["actor"]]
 
-    def _count_alone(self, sweeps: Sequence[_SweepRays], chunk: _RayChunk) -> None:
+    def _count_alone(self, sweeps: Sequence[_SweepRays], chunk: RayChunk) -> None:
         """Add the number of rays that would hit each actor if it were alone."""
         actors = np.unique(np.concatenate([sweep.records["actor"] for sweep in sweeps]))
         for actor in actors.tolist():
@@ -255,7 +209,7 @@ class ActorVisibility:
                 count = np.count_nonzero((sweep.first <= rays) & (rays < sweep.stop))
                 sweep.records["rays"][sweep.records["actor"] == actor] += count
 
-    def _measure_boxes(self, sweep: _SweepRays, chunks: Iterable[_RayChunk]) -> None:
+    def _measure_boxes(self, sweep: _SweepRays, chunks: Iterable[RayChunk]) -> None:
         """Set the truncation of boxes, and the distance of rays from actors that no ray hits."""
         from . import box_distance_loops as loops  # imported here because numba is slow to import
 

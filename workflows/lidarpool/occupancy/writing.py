@@ -1,0 +1,285 @@
+"""Compute the occupancy grids of a scenario or campaign in worker processes, and write them.
+
+Each worker prepares the jobs of its tasks from the files of the scenario, and simulates the rays of
+the sweeps. No point cloud is required, and the files do not depend on the number of workers.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.io.storage import TEMPORARY
+from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGrid
+from lidarsim.words import join_names
+
+from ..clouds.cloud_format import Entry
+from ..run.cluster.worker_map import parallel_map
+from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_file import is_campaign
+from ..scenario.job import Job
+from ..scenario.prepare import prepare
+from ..scenario.scenario import Scenario
+from .layouts import LAYOUTS, Layout
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+INFO_FILE = "occupancy.json"
+_TASK_SWEEPS = 4
+_WORKER_BYTES = 2 << 30
+
+
+@dataclass(frozen=True)
+class OccupancySettings:
+    """Options of occupancy grids.
+
+    Attributes
+    ----------
+    layout
+        Name of the layout, as in `LAYOUTS`.
+    grid
+        Extent and voxel size, or None for those of the layout.
+    frame
+        Frame of the grid, or None for that of the layout.
+    sensor
+        Name of the sensor, or None for the first one.
+    following
+        Number of following sweeps whose rays also make voxels valid.
+    backend
+        Ray-casting backend.
+
+    Raises
+    ------
+    LidarError
+        If the layout does not support an option.
+    """
+
+    layout: str
+    grid: VoxelGrid | None = None
+    frame: GridFrame | None = None
+    sensor: str | None = None
+    following: int = 0
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.following and self.layout != "semantickitti":
+            raise LidarError(
+                "`--following` affects the .invalid files, which only exist in the layout "
+                "semantickitti."
+            )
+
+    @property
+    def chosen_grid(self) -> VoxelGrid:
+        """Grid that is written."""
+        return self.grid or LAYOUTS[self.layout].grid
+
+    @property
+    def chosen_frame(self) -> GridFrame:
+        """Frame of the grid."""
+        return self.frame or LAYOUTS[self.layout].frame
+
+
+class _Task(NamedTuple):
+    """Consecutive sweeps of a job."""
+
+    path: Path
+    number: int | None  # job of a campaign, or None for a scenario
+    settings: OccupancySettings
+    sweeps: range
+
+
+@dataclass(frozen=True)
+class _OpenJob:
+    """Job whose scenario has been read."""
+
+    path: Path
+    number: int | None
+    settings: OccupancySettings
+
+    @cached_property
+    def job(self) -> Job:
+        """Scene and survey."""
+        if self.number is None:
+            return prepare(Scenario.load(self.path), plans=False).job
+        return CampaignSpec.load(self.path).job(self.number)
+
+    @cached_property
+    def sensor(self) -> int:
+        """Number of the chosen sensor."""
+        names = [carried.name for carried in self.job.survey.mounted_sensors]
+        name = self.settings.sensor
+        if name is None:
+            return 0
+        if name not in names:
+            known = join_names([other for other in names if other]) or "none with a name"
+            raise LidarError(
+                f"{self.path} has no sensor {name!r}. The sensors of the scenario are {known}."
+            )
+        return names.index(name)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Names and content of the files."""
+        job = self.job
+        entry = None if self.number is None else Entry(job.number, job.name, job.split, job.values)
+        return LAYOUTS[self.settings.layout](job.sweeps, entry, self.sensor)
+
+    @cached_property
+    def simulator(self) -> OccupancySimulator:
+        """Simulator of the grids."""
+        settings = self.settings
+        return OccupancySimulator(
+            self.job.scene,
+            self.job.survey,
+            settings.chosen_grid,
+            sensor=self.sensor,
+            frame=settings.chosen_frame,
+            backend=settings.backend,
+            threads=1,  # sweeps are computed in parallel
+        )
+
+
+@lru_cache(maxsize=1)
+def _open_job(path: Path, number: int | None, settings: OccupancySettings) -> _OpenJob:
+    return _OpenJob(path, number, settings)
+
+
+def _compute_files(task: _Task) -> dict[str, bytes]:
+    """Return the files of the sweeps of a task."""
+    opened = _open_job(task.path, task.number, task.settings)
+    files: dict[str, bytes] = {}
+    for sweep in task.sweeps:
+        occupancy = opened.simulator.sweep(sweep, task.settings.following)
+        files |= zip(opened.layout.paths(sweep), opened.layout.contents(occupancy), strict=True)
+    return files
+
+
+class WrittenOccupancy(NamedTuple):
+    """Summary of written occupancy grids."""
+
+    jobs: int
+    sweeps: int
+    files: int
+    notes: tuple[str, ...]
+
+
+def write_occupancy(
+    path: Path,
+    out: Path,
+    settings: OccupancySettings,
+    *,
+    job: int | None = None,
+    client: Client | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> WrittenOccupancy:
+    """Write the occupancy grids of all sweeps of a scenario or campaign.
+
+    Parameters
+    ----------
+    path
+        Scenario or campaign file.
+    out
+        Output folder.
+    settings
+        Layout, grid and sensor.
+    job
+        Number of the only job of the campaign to write, or None for all jobs.
+    client
+        Client of a cluster whose OTHER workers can read the scenario at the same path. By default,
+        processes on this machine compute the grids.
+    workers
+        Number of processes on this machine. The files do not depend on it.
+    overwrite
+        Whether to replace existing files.
+    progress
+        Function that is called with the numbers of finished and of all sweeps.
+
+    Raises
+    ------
+    LidarError
+        If the scenario cannot be read, or if files exist or cannot be written.
+    """
+    path = path.absolute()
+    numbers = _job_numbers(path, job)
+    notes: dict[str, None] = {}
+    tasks: list[_Task] = []
+    for number in numbers:
+        layout = _open_job(path, number, settings).layout
+        notes |= dict.fromkeys(layout.notes())
+        if not overwrite:
+            _check_missing(out, layout)
+        tasks += [
+            _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
+            for first in range(0, layout.count, _TASK_SWEEPS)
+        ]
+    total = sum(len(task.sweeps) for task in tasks)
+    done = 0
+    file_count = 0
+    with (
+        parallel_map(client, len(tasks), _WORKER_BYTES, workers) as run,
+        explain_os_errors(f"The grids cannot be written to {out}", "free some disk space"),
+    ):
+        for task, files in zip(tasks, run(_compute_files, tasks), strict=True):
+            for name, content in files.items():
+                _write(out / name, content)
+            file_count += len(files)
+            done += len(task.sweeps)
+            progress(done, total)
+        _write(out / INFO_FILE, _info(settings))
+    return WrittenOccupancy(len(numbers), total, file_count, tuple(notes))
+
+
+def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
+    """Return the numbers of the jobs to write, or None for the only job of a scenario."""
+    if not is_campaign(path):
+        if job is not None:
+            raise LidarError(f"`--job` can only be used with campaigns, but {path} is a scenario.")
+        return [None]
+    numbers = CampaignSpec.load(path).numbers
+    if job is None:
+        return numbers
+    if job not in numbers:
+        raise LidarError(
+            f"Job {job} does not exist. The jobs of the campaign are 0 to {len(numbers) - 1}."
+        )
+    return [job]
+
+
+def _check_missing(out: Path, layout: Layout) -> None:
+    """Raise LidarError if a file of the layout exists."""
+    for number in range(layout.count):
+        for name in layout.paths(number):
+            if (out / name).exists():
+                raise LidarError(
+                    f"{out / name} already exists. Use another folder with `--out`, or pass "
+                    "`--overwrite`."
+                )
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file atomically, creating its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{TEMPORARY}{path.name}")
+    temporary.write_bytes(content)
+    temporary.replace(path)
+
+
+def _info(settings: OccupancySettings) -> bytes:
+    """Return a JSON document that describes the grid."""
+    info = {
+        "layout": settings.layout,
+        "frame": settings.chosen_frame,
+        "sensor": settings.sensor,
+        "following": settings.following,
+        **asdict(settings.chosen_grid),
+        "shape": settings.chosen_grid.shape,
+    }
+    return json.dumps(info, indent=1).encode() + b"\n"
