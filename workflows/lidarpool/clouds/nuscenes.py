@@ -7,6 +7,7 @@ import json
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from hashlib import md5
 from itertools import chain, pairwise
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from lidarsim.columns.actor_rays import NO_ACTOR_RAYS
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.environment.extras import reading
@@ -408,7 +410,9 @@ class _Tables:
         self.sweeps = sweeps
         self._entry = entry
         self.scene = _SCENE if entry is None else entry.name
-        self._salt = f"{'' if entry is None else f'{entry.name} '}{fingerprint(sweeps)}"
+        # Rays are only counted by a run, but tokens are also required without one.
+        planned = fingerprint(replace(sweeps, actor_rays=NO_ACTOR_RAYS))
+        self._salt = f"{'' if entry is None else f'{entry.name} '}{planned}"
         self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}
         self._add("log", _LOG, logfile="", vehicle="", date_captured=_DATE, location="")
         logs = [self.token("log", _LOG)]

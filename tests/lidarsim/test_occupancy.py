@@ -1,0 +1,270 @@
+"""Occupancy of voxel grids: closed forms, containment, and rays by brute force."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from tests.lidarsim.test_scene_flow import straight
+from tests.shapes import block, level, solid
+
+from lidarpool import Material, Mounted, Pose, Scene, Sensor, Survey
+from lidarsim import Actor, LidarError, SceneMesh, box
+from lidarsim.scene.files.meshfile import load_objects
+from lidarsim.scene.scene_instances import SceneInstance
+from lidarsim.simulator.occupancy import FREE, OccupancySimulator, VoxelGrid
+from lidarsim.simulator.occupancy import voxel_loops as loops
+from lidarsim.simulator.occupancy.marks import HIT, TRAVERSED
+
+SENSOR = Sensor.grid(720, 60, 60.0, step_deg=360, min_range_m=0.5, max_range_m=30.0)
+FEW_RAYS = Sensor.grid(36, 8, 60.0, step_deg=360, min_range_m=0.5, max_range_m=30.0)
+GRID = VoxelGrid((-4, -4, -2), (12, 4, 2), 0.5)
+PEDESTRIAN = Path(__file__).parents[2] / "examples/pedestrian.glb"
+
+
+def occupancy_of(scene, survey=None, grid=GRID, number=0, **options):
+    survey = survey or Survey(SENSOR, poses=[(0, 0, 0)], steps=1)
+    return OccupancySimulator(scene, survey, grid, backend="numpy", **options).sweep(number)
+
+
+def centers_of(grid):
+    steps = [np.arange(count) + 0.5 for count in grid.shape]
+    cells = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1)
+    return cells * grid.voxel_m + np.array(grid.lower)
+
+
+def overlap(grid, lower, upper):
+    """Voxels that overlap a box whose sides lie inside voxels."""
+    centers = centers_of(grid)
+    half = grid.voxel_m / 2
+    return ((centers + half > lower) & (centers - half < upper)).all(axis=-1)
+
+
+def test_a_box_in_front_of_a_sensor_is_occupied_and_hides_what_is_behind_it():
+    lower, upper = np.array([4.1, -1.2, -1.3]), np.array([6.3, 1.4, 1.1])
+    mesh = block("Box", upper - lower, (lower + upper) / 2)
+    scene = Scene.from_meshes([mesh])
+    survey = Survey(
+        SENSOR, poses=[(0, 0, 0)], steps=1, materials=[Material("*", semantic_class=10)]
+    )
+    found = occupancy_of(scene, survey)
+    expected = overlap(GRID, lower, upper)
+    np.testing.assert_array_equal(found.occupied, expected)
+    np.testing.assert_array_equal(found.classes, np.where(expected, 10, 0))
+    np.testing.assert_array_equal(found.instances, np.where(expected, 0, FREE))
+    x, y, z = np.moveaxis(centers_of(GRID), -1, 0)
+    beside = (np.abs(y) < 0.5) & (np.abs(z) < 0.5)
+    front = beside & (x > 4) & (x < 4.5)
+    assert found.hit[front].all() and front.any()
+    before = beside & (x > 1) & (x < 4)
+    assert (found.observed & ~found.occupied & ~found.hit)[before].all()
+    # The shadow has the directions of the front side; this part of it contains whole voxels.
+    shadow = (x > 5) & (np.abs(y) < 1.0 / 4.1 * (x - 0.25) - 0.25)
+    shadow &= np.abs(z) < 1.0 / 4.1 * (x - 0.25) - 0.25
+    assert shadow.sum() > 200 and not found.observed[shadow].any()
+    assert not found.hit[~expected].any()
+    sky = (x < -1) & (x > -3) & beside  # rays without a return observe up to the maximum range
+    assert found.observed[sky].all()
+
+
+def turns_around(mesh, points):
+    """Solid angle of a mesh seen from points, as a fraction of the sphere (Van Oosterom 1983)."""
+    total = np.zeros(len(points))
+    for corners in mesh.triangles:
+        a, b, c = corners[:, None] - points
+        sizes = [np.linalg.norm(vector, axis=1) for vector in (a, b, c)]
+        above = np.einsum("ni,ni->n", a, np.cross(b, c))
+        below = sizes[0] * sizes[1] * sizes[2]
+        for p, q, size in ((a, b, sizes[2]), (b, c, sizes[0]), (c, a, sizes[1])):
+            below += np.einsum("ni,ni->n", p, q) * size
+        total += 2 * np.arctan2(above, below)
+    return total / (4 * np.pi)
+
+
+def test_voxels_with_centers_in_closed_meshes_are_occupied():
+    ring = trimesh.creation.torus(2.0, 0.9, 16, 12)
+    ball = trimesh.creation.icosphere(1, 1.0)
+    turn = trimesh.transformations.euler_matrix(0.3, 0.7, 0.2) @ np.diag([1.5, 1.2, 1.0, 1.0])
+    turn[:3, 3] = 7, 0.3, 0.2
+    ball_mesh = solid("Ball", ball)
+    instance = SceneInstance(ball_mesh, turn, "Ball")
+    open_ball = SceneMesh("Half", ball.vertices * 1.3 + (9.5, 2, 0), ball.faces[:-8])
+    ring.apply_transform(trimesh.transformations.euler_matrix(0.4, 0.2, 0.1))
+    scene = Scene.from_meshes([solid("Ring", ring), instance, open_ball])
+    grid = VoxelGrid((-4, -4, -2), (12, 4, 2), 0.4)
+    found = occupancy_of(scene, Survey(FEW_RAYS, poses=[(0, 0, 0)], steps=1), grid)
+    centers = centers_of(grid).reshape(-1, 3)
+    placed = ball.copy().apply_transform(turn)
+    inside = [turns_around(mesh, centers).reshape(grid.shape) > 0.5 for mesh in (ring, placed)]
+    for number, contained in enumerate(inside):
+        assert contained.sum() > 40
+        assert (found.instances[contained] == number).all()
+    # All other occupied voxels intersect a surface, and all sampled points are in such voxels.
+    rest = found.occupied & ~inside[0] & ~inside[1]
+    meshes = [ring, placed, trimesh.Trimesh(open_ball.vertices, open_ball.faces)]
+    for number, mesh in enumerate(meshes):
+        points, _ = trimesh.sample.sample_surface(mesh, 5_000, seed=1)
+        cells = np.floor(grid.to_voxels(points)).astype(int)
+        cells = cells[((cells >= 0) & (cells < grid.shape)).all(axis=1)]
+        assert (found.instances[tuple(cells.T)] == number).all()
+        _, away, _ = trimesh.proximity.closest_point_naive(
+            mesh, centers_of(grid)[rest & (found.instances == number)][::4]
+        )
+        assert away.max() <= 0.4 * np.sqrt(3) / 2 + 1e-6
+    middle = tuple(np.floor(grid.to_voxels(np.array([[9.5, 2.0, 0.0]]))[0]).astype(int))
+    assert not found.occupied[middle]  # the mesh is open
+
+
+def test_surfaces_intersect_the_same_voxels_as_clipped_triangles():
+    random = np.random.default_rng(4)
+    corners = random.uniform(-1, 7, (40, 3, 3))
+    for triangle in corners:
+        found = np.full((6, 5, 4), -1, np.int32)
+        loops.add_surfaces(triangle[None], np.zeros(1, np.int32), found, np.full(found.shape, 9e9))
+        weights = random.dirichlet((1, 1, 1), 4000)
+        cells = np.floor(weights @ triangle).astype(int)
+        cells = cells[((cells >= 0) & (cells < found.shape)).all(axis=1)]
+        assert (found[tuple(cells.T)] == 0).all()
+        for cell in np.argwhere(found == 0):
+            assert clipped(triangle, cell - 2e-6, cell + 1 + 2e-6)
+
+
+def clipped(polygon, lower, upper):
+    """Whether a polygon has a part between two corners (Sutherland and Hodgman)."""
+    polygon = list(polygon)
+    for axis, (bound, sign) in product(range(3), ((0, 1), (1, -1))):
+        limit = (lower, upper)[bound][axis]
+        kept = []
+        for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+            from_a, from_b = sign * (a[axis] - limit), sign * (b[axis] - limit)
+            if from_a >= 0:
+                kept.append(a)
+            if (from_a >= 0) != (from_b >= 0):
+                kept.append(a + (b - a) * from_a / (from_a - from_b))
+        polygon = kept
+    return bool(polygon)
+
+
+def test_rays_pass_the_voxels_that_brute_force_finds():
+    random = np.random.default_rng(7)
+    shape = (8, 6, 5)
+    origins = random.uniform(-3, 10, (3, 300))
+    directions = random.normal(size=(3, 300))
+    directions[0, :20] = 0
+    directions[1, 10:30] = 0
+    directions /= np.linalg.norm(directions, axis=0)
+    ends = random.uniform(1, 15, 300)
+    hits = random.random(300) < 0.5
+    lower = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
+    for ray in range(300):
+        marks = np.zeros(shape, np.uint8)
+        one = np.s_[:, ray : ray + 1]
+        loops.add_rays(
+            origins[one].copy(), directions[one].copy(), 0.5, ends[[ray]], hits[[ray]], marks
+        )
+        begin, end = np.full(shape, 0.5), np.full(shape, ends[ray])
+        for axis in range(3):
+            origin, direction = origins[axis, ray], directions[axis, ray]
+            if direction == 0:
+                end[(origin < lower[..., axis]) | (origin > lower[..., axis] + 1)] = -np.inf
+                continue
+            first = (lower[..., axis] - origin) / direction
+            second = (lower[..., axis] + 1 - origin) / direction
+            begin = np.maximum(begin, np.minimum(first, second))
+            end = np.minimum(end, np.maximum(first, second))
+        assert (marks[end - begin > 1e-9] & TRAVERSED).all()
+        assert (end - begin > -1e-9)[marks > 0].all()
+        at = np.floor(origins[:, ray] + ends[ray] * directions[:, ray]).astype(int)
+        is_hit = hits[ray] and ((at >= 0) & (at < shape)).all()
+        assert np.argwhere(marks & HIT).tolist() == ([at.tolist()] if is_hit else [])
+
+
+def test_actors_are_at_their_poses_at_the_start_of_a_sweep():
+    car = Actor(box("Car", (2.2, 1.4, 0.9)), straight((3.1, 1.1, -1.55), (20, 0, 0)))
+    late = Actor(box("Late", (1.0, 1.0, 1.0)), straight((-2.2, -2.2, 0.0), (0, 0, 0), 0.15, beyond="absent"))
+    ground = level("Ground", -1.8)
+    scene = Scene.from_meshes([ground]).with_actors([car, late])
+    path = straight((0, 0, 0), (10, 0, 0))
+    survey = Survey(
+        sensors=[Mounted(FEW_RAYS, Pose((0, 0, 0.2)), "roof")], trajectory=path, steps=3,
+        materials=[
+            Material("Car", semantic_class=10), Material("*", semantic_class=40),
+        ],
+    )  # fmt: skip
+    for number in range(3):
+        found = occupancy_of(scene, survey, number=number, frame="platform")
+        start_s = survey.sweeps_each[0].starts_ns[number] / 1e9
+        x = 3.1 + 10 * start_s
+        body = overlap(GRID, (x - 1.1, 0.4, -1.55), (x + 1.1, 1.8, -0.65))
+        road = overlap(GRID, (-40, -40, -1.81), (40, 40, -1.79))
+        assert (found.classes[body & ~road] == 10).all()
+        assert (found.instances[body & ~road] == 1).all()
+        assert (found.classes[road & ~body] == 40).all() and (found.occupied[road]).all()
+        present = overlap(GRID, (-2.7 - 10 * start_s, -2.7, -0.5), (-1.7 - 10 * start_s, -1.7, 0.5))
+        assert (found.instances[present & ~road] == (2 if start_s <= 0.15 else FREE)).all()
+    in_sensor = occupancy_of(scene, survey, VoxelGrid((-4, -4, -2.2), (12, 4, 1.8), 0.5))
+    in_platform = occupancy_of(scene, survey, frame="platform")
+    np.testing.assert_array_equal(in_sensor.instances, in_platform.instances)
+    np.testing.assert_array_equal(in_sensor.observed, in_platform.observed)
+
+
+def test_the_closest_surface_and_the_visible_objects_count():
+    ground = level("Ground", -1.7)  # 0.05 m above the centers of the lowest voxels
+    hood = block("Hood", (1.0, 1.0, 0.2), (0.6, 0.1, -0.9))
+    crate = block("Crate", (0.9, 0.9, 0.1), (5.1, 0.1, -1.78))  # its top is 0.02 m above them
+    scene = Scene.from_meshes([ground, hood, crate])
+    carried = Mounted(SENSOR, Pose((0, 0, 0)), unseen=["Hood"])
+    survey = Survey(sensors=[carried], poses=[(0, 0, 0)], steps=1)
+    found = occupancy_of(scene, survey)
+    top = overlap(GRID, (4.7, -0.3, -1.9), (5.4, 0.4, -1.6))
+    assert top.sum() == 4
+    np.testing.assert_array_equal(found.instances == 2, top)
+    lowest = found.instances[:, :, 0]
+    assert set(np.unique(lowest)) == {0, 2} and (found.instances[:, :, 1:] == FREE).all()
+    assert found.observed[overlap(GRID, (1.1, -0.2, -0.95), (1.2, 0.2, -0.85))].all()
+
+
+def test_a_walking_person_is_deformed_as_at_the_start_of_a_sweep():
+    (mesh,) = load_objects(PEDESTRIAN, animation="Walk").static
+    person = Actor(mesh, straight((4.0, 0.1, -1.4), (1.4, 0, 0)))
+    scene = Scene.from_meshes([level("Ground", -1.9)]).with_actors([person])
+    survey = Survey(FEW_RAYS, trajectory=straight((0, 0, 0), (0, 0, 1e-9)), steps=4)
+    grid = VoxelGrid((3, -1, -1.7), (6, 1, 0.9), 0.1)
+    shapes = []
+    for number in (0, 3):
+        found = occupancy_of(scene, survey, grid, number)
+        moved = person.mesh_at(survey.sweeps_each[0].starts_ns[number])
+        cells = np.floor(grid.to_voxels(moved.vertices[np.unique(moved.faces)])).astype(int)
+        cells = cells[((cells >= 0) & (cells < grid.shape)).all(axis=1)]
+        assert len(cells) > 100 and (found.instances[tuple(cells.T)] == 1).all()
+        shapes.append(found.occupied.sum())
+    assert shapes[0] != shapes[1]
+
+
+def test_following_sweeps_observe_more():
+    scene = Scene.from_meshes([block("Box", (2, 2, 2), (5, 0, 0))])
+    survey = Survey(SENSOR, trajectory=straight((0, 0, 0), (0, 30, 0)), steps=3)
+    simulator = OccupancySimulator(scene, survey, GRID, backend="numpy")
+    alone = simulator.sweep(0)
+    np.testing.assert_array_equal(alone.observed_later, alone.observed)
+    later = simulator.sweep(0, following=5)  # there are two
+    np.testing.assert_array_equal(later.observed, alone.observed)
+    gained = later.observed_later & ~later.observed
+    assert gained.sum() > 100 and (later.observed_later | ~later.observed).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (((0, 0, 0), (1, 1, 1), 0.3), "must be a multiple of the voxel size, 0.3 m"),
+        (((0, 0, 0), (1, 1, -1), 0.5), "must be a multiple"),
+        (((0, 0, 0), (1000, 1000, 1000), 0.1), "at most 100,000,000 voxels"),
+        (((0, 0, 0), (np.inf, 1, 1), 0.1), "must be finite"),
+    ],
+)
+def test_invalid_grids(arguments, words):
+    with pytest.raises(LidarError, match=words):
+        VoxelGrid(*arguments)
