@@ -130,7 +130,10 @@ def test_grids_of_given_extent_of_another_sensor(scenario):
 
 def test_jobs_of_campaigns(scenario):
     campaign = scenario.with_name("campaign.yaml")
-    campaign.write_text("base: street.yaml\ncount: 2\nvary: {sensors.roof.mount.position.2: {each: [0.5, 0.6]}}\nkeep: nuscenes\n")
+    campaign.write_text(
+        "base: street.yaml\ncount: 2\nkeep: nuscenes\n"
+        "vary: {sensors.roof.mount.position.2: {each: [0.5, 0.6]}}\n"
+    )
     options = ["--layout", "occ3d", "--workers", "1"]
     grid = ["--extent=-2,-2,-1,2,2,3", "--voxel-size", "1"]
     outcome = invoke(campaign, scenario.parent / "jobs", *options, *grid)

@@ -184,7 +184,9 @@ def test_rays_pass_the_voxels_that_brute_force_finds():
 
 def test_actors_are_at_their_poses_at_the_start_of_a_sweep():
     car = Actor(box("Car", (2.2, 1.4, 0.9)), straight((3.1, 1.1, -1.55), (20, 0, 0)))
-    late = Actor(box("Late", (1.0, 1.0, 1.0)), straight((-2.2, -2.2, 0.0), (0, 0, 0), 0.15, beyond="absent"))
+    late = Actor(
+        box("Late", (1.0, 1.0, 1.0)), straight((-2.2, -2.2, 0.0), (0, 0, 0), 0.15, beyond="absent")
+    )
     ground = level("Ground", -1.8)
     scene = Scene.from_meshes([ground]).with_actors([car, late])
     path = straight((0, 0, 0), (10, 0, 0))

@@ -147,7 +147,9 @@ class SceneVoxels:
             vertices = mesh.animation.vertices_at(actor.frames_at(at_ns)[0])[0][0]
         positions, rotations = full_poses(actor.trajectory, 0, at_ns)
         vertices = rotate(vertices, rotations[0]) + positions[0]
-        return Body(vertices, mesh.faces, None, self._closed_parts(mesh.vertices, mesh.faces), first)
+        return Body(
+            vertices, mesh.faces, None, self._closed_parts(mesh.vertices, mesh.faces), first
+        )
 
     def _closed_parts(
         self, vertices: Floats, faces: Integers, owners: Integers | None = None
