@@ -151,7 +151,7 @@ def test_jobs_of_campaigns(scenario):
     ("options", "words"),
     [
         (["--layout", "occ3d", "--sensor", "side"], "Occ3D requires the first sensor"),
-        (["--layout", "occ3d", "--sensor", "none"], "The sensors of the scenario are roof and side"),
+        (["--layout", "occ3d", "--sensor", "none"], "The sensors of the scenario are roof"),
         (["--layout", "occ3d", "--following", "2"], "only exist in the layout semantickitti"),
         (["--layout", "occ3d", "--voxel-size", "0.3"], "must be a multiple of the voxel size"),
         (["--layout", "occ3d", "--extent", "1,2,3"], "is not an extent"),

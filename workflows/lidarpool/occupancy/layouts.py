@@ -25,7 +25,7 @@ FREE_OCC3D = 17
 OTHER_OBJECT = 99  # class of SemanticKITTI that evaluations ignore
 
 
-class Layout(ABC):
+class GridLayout(ABC):
     """Names and content of the files of a job.
 
     Parameters
@@ -70,7 +70,7 @@ class Layout(ABC):
         return []
 
 
-class Occ3d(Layout):
+class Occ3d(GridLayout):
     """Layout of Occ3D-nuScenes: `gts/SCENE/FRAME_TOKEN/labels.npz`.
 
     The archive contains `semantics` (uint8; 17 is free), `mask_lidar` and `mask_camera` (uint8; 1
@@ -124,7 +124,7 @@ class Occ3d(Layout):
         ]
 
 
-class SemanticKitti(Layout):
+class SemanticKitti(GridLayout):
     """Layout of SemanticKITTI: `sequences/00/voxels/000000.bin`, `.label` and so on.
 
     - `.bin`: bits of the voxels in which a ray of the sweep hits a surface.
@@ -173,6 +173,6 @@ def _as_uint16(voxels: Integers) -> bytes:
     return voxels.astype("<u2").tobytes()
 
 
-LAYOUTS: Mapping[str, type[Layout]] = MappingProxyType(
+LAYOUTS: Mapping[str, type[GridLayout]] = MappingProxyType(
     {"occ3d": Occ3d, "semantickitti": SemanticKitti}
 )

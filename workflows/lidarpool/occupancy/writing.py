@@ -25,7 +25,7 @@ from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
-from .layouts import LAYOUTS, Layout
+from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -124,7 +124,7 @@ class _OpenJob:
         return names.index(name)
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> GridLayout:
         """Names and content of the files."""
         job = self.job
         entry = None if self.number is None else Entry(job.number, job.name, job.split, job.values)
@@ -189,7 +189,7 @@ def write_occupancy(
     out
         Output folder.
     settings
-        Layout, grid and sensor.
+        GridLayout, grid and sensor.
     job
         Number of the only job of the campaign to write, or None for all jobs.
     client
@@ -253,7 +253,7 @@ def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
     return [job]
 
 
-def _check_missing(out: Path, layout: Layout) -> None:
+def _check_missing(out: Path, layout: GridLayout) -> None:
     """Raise LidarError if a file of the layout exists."""
     for number in range(layout.count):
         for name in layout.paths(number):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -40,30 +39,42 @@ class ClosedParts(NamedTuple):
         """
         from . import voxel_loops as loops  # imported here because numba is slow to import
 
-        object_of_vertex = np.zeros((len(vertices), 1))
-        object_of_vertex[faces.ravel(), 0] = np.repeat(owners, 3)
-        keyed = np.concatenate([vertices + 0.0, object_of_vertex], axis=1)  # -0 becomes 0
-        rows = np.ascontiguousarray(keyed).view(np.dtype((np.void, keyed.itemsize * 4)))[:, 0]
-        unique, merged = np.unique(rows, return_inverse=True)
-        corners = merged.reshape(-1)[faces].astype(np.int64)
-        following = np.roll(corners, -1, axis=1)
-        proper = np.flatnonzero((corners != following).all(axis=1))
-        count = len(unique)
-        roots = loops.components_of(corners[proper], count)
-        component = roots[corners[proper, 0]]
-        edges = (corners[proper] * count + following[proper]).ravel()
-        opposite = (following[proper] * count + corners[proper]).ravel()
-        known, times = np.unique(edges, return_counts=True)
-        single = times[np.searchsorted(known, edges)] == 1
-        at = np.minimum(np.searchsorted(known, opposite), max(len(known) - 1, 0))
-        open_edges = ~(single & (known[at] == opposite)) if len(known) else np.zeros(0, np.bool_)
+        corners, count = _merged_corners(vertices, faces, owners)
+        proper = np.flatnonzero((corners != np.roll(corners, -1, axis=1)).all(axis=1))
+        corners = corners[proper]
+        component = loops.components_of(corners, count)[corners[:, 0]]
         is_open = np.zeros(count, np.bool_)
-        is_open[np.repeat(component, 3)[open_edges]] = True
-        kept = ~is_open[component]
-        order = np.argsort(component[kept], kind="stable")
-        sorted_components = component[kept][order]
-        first = np.flatnonzero(np.diff(sorted_components, prepend=-1))
-        return cls(proper[kept][order], np.append(first, len(order)))
+        is_open[component[_has_open_edge(corners, count)]] = True
+        kept = np.flatnonzero(~is_open[component])
+        kept = kept[np.argsort(component[kept], kind="stable")]
+        first_rows = np.flatnonzero(np.diff(component[kept], prepend=-1))
+        return cls(proper[kept], np.append(first_rows, len(kept)))
+
+
+def _merged_corners(vertices: Floats, faces: Integers, owners: Integers) -> tuple[Ints, int]:
+    """Return the corners (f, 3) of faces as numbers of distinct vertices, and their number."""
+    object_of_vertex = np.zeros((len(vertices), 1))
+    object_of_vertex[faces.ravel(), 0] = np.repeat(owners, 3)
+    keys = np.concatenate([vertices + 0.0, object_of_vertex], axis=1)  # -0 becomes 0
+    rows = keys.view(np.dtype((np.void, keys.itemsize * 4)))[:, 0]
+    distinct, merged = np.unique(rows, return_inverse=True)
+    return merged.reshape(-1)[faces].astype(np.int64), len(distinct)
+
+
+def _has_open_edge(corners: Ints, count: int) -> Bools:
+    """Return whether each face has an edge that does not join two faces of equal orientation.
+
+    `corners` (f, 3) are numbers below `count`.
+    """
+    if not len(corners):
+        return np.zeros(0, np.bool_)
+    following = np.roll(corners, -1, axis=1)
+    edges = corners * count + following
+    opposite = following * count + corners
+    distinct, times = np.unique(edges, return_counts=True)
+    is_single = times[np.searchsorted(distinct, edges)] == 1
+    rows = np.minimum(np.searchsorted(distinct, opposite), len(distinct) - 1)
+    return np.asarray(~(is_single & (distinct[rows] == opposite)).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,15 @@ _HALF = 0.5 + SLACK
 
 
 @inlined
-def _separated(p0, p1, q0, q1, r0, r1, a, b):
-    """Return whether the axis (a, b) separates the projected triangle from the voxel's square."""
-    p = a * p0 + b * p1
-    q = a * q0 + b * q1
-    r = a * r0 + b * r1
-    radius = _HALF * (abs(a) + abs(b))
+def _separated(a, b, c, first, second, u, v):
+    """Return whether an axis separates the projections of a triangle and the cube.
+
+    The axis has the components `u` and `v` along the coordinate axes `first` and `second`.
+    """
+    p = u * a[first] + v * a[second]
+    q = u * b[first] + v * b[second]
+    r = u * c[first] + v * c[second]
+    radius = _HALF * (abs(u) + abs(v))
     return min(p, min(q, r)) > radius or max(p, max(q, r)) < -radius
 
 
@@ -47,9 +50,9 @@ def _intersects(a, b, c, n):
         else:
             x, y, z = a[0] - c[0], a[1] - c[1], a[2] - c[2]
         if (
-            _separated(a[1], a[2], b[1], b[2], c[1], c[2], -z, y)
-            or _separated(a[0], a[2], b[0], b[2], c[0], c[2], z, -x)
-            or _separated(a[0], a[1], b[0], b[1], c[0], c[1], -y, x)
+            _separated(a, b, c, 1, 2, -z, y)
+            or _separated(a, b, c, 0, 2, z, -x)
+            or _separated(a, b, c, 0, 1, -y, x)
         ):
             return False
     return True
@@ -103,17 +106,17 @@ def _square(a, b, c, n):
 @inlined
 def _first(low, limit):
     """Return the first voxel along an axis that a surface from `low` on touches."""
-    return max(int(math.ceil(max(low - 1 - SLACK, -1.0))), 0) if low < limit + 1 else limit
+    return max(math.ceil(max(low - 1 - SLACK, -1.0)), 0) if low < limit + 1 else limit
 
 
 @inlined
 def _last(high, limit):
     """Return the last voxel along an axis that a surface up to `high` touches, or -1."""
-    return min(int(math.floor(min(high + SLACK, limit + 1.0))), limit - 1) if high > -1 else -1
+    return min(math.floor(min(high + SLACK, limit + 1.0)), limit - 1) if high > -1 else -1
 
 
 @compiled()
-def add_surfaces(corners, numbers, triangle, square):
+def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compiled loop
     """Set the triangle of each voxel that triangles intersect.
 
     `corners` (f, 3, 3) and `numbers` (f,) are triangles and their numbers. If several triangles
@@ -190,7 +193,7 @@ def _turns(t, x, y):
 
 
 @compiled()
-def add_interior(corners, number, triangle):
+def add_interior(corners, number, triangle):  # noqa: C901 - a compiled loop
     """Set the triangle of each voxel whose center is inside a closed surface.
 
     `corners` (f, 3, 3) are the triangles of the surface, with consistent orientation. Voxels that
@@ -223,7 +226,7 @@ def add_interior(corners, number, triangle):
                 if n[2] != 0:
                     rise = (n[0] * (i + 0.5 - t[0, 0]) + n[1] * (j + 0.5 - t[0, 1])) / n[2]
                     z = min(max(t[0, 2] - rise, z), max(t[0, 2], t[1, 2], t[2, 2]))
-                k = min(max(int(math.ceil(z - 0.5)), first[2]), stop[2])
+                k = min(max(math.ceil(z - 0.5), first[2]), stop[2])
                 turns[i - first[0], j - first[1], k - first[2]] += turn
     for i in range(first[0], stop[0]):
         for j in range(first[1], stop[1]):
@@ -235,7 +238,7 @@ def add_interior(corners, number, triangle):
 
 
 @compiled()
-def add_rays(origins, directions, t_min, t_ends, hits, marks):
+def add_rays(origins, directions, t_min, t_ends, hits, marks):  # noqa: C901 - a compiled loop
     """Mark the voxels that rays pass through or hit.
 
     Each ray k is the segment from `t_min` to `t_ends[k]` of ``origins[:, k] + t * directions[:,
@@ -263,7 +266,7 @@ def add_rays(origins, directions, t_min, t_ends, hits, marks):
             continue
         for axis in range(3):
             at = origins[axis, ray] + begin * directions[axis, ray]
-            voxel[axis] = min(max(int(math.floor(at)), 0), shape[axis] - 1)
+            voxel[axis] = min(max(math.floor(at), 0), shape[axis] - 1)
         while True:
             crossing = np.inf
             across = 0
