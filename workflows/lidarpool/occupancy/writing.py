@@ -189,7 +189,7 @@ def write_occupancy(
     out
         Output folder.
     settings
-        GridLayout, grid and sensor.
+        Layout, grid and sensor.
     job
         Number of the only job of the campaign to write, or None for all jobs.
     client
