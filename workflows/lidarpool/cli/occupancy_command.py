@@ -152,7 +152,7 @@ def occupancy(
         frame,
         sensor,
         following,
-        backend or "auto",
+        backend,
     )
     client = nullcontext() if scheduler is None else connect_client(scheduler, files)
     with (

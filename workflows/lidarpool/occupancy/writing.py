@@ -52,7 +52,7 @@ class OccupancySettings:
     following
         Number of following sweeps whose rays also make voxels valid.
     backend
-        Ray-casting backend.
+        Ray-casting backend, or None for that of the scenario.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class OccupancySettings:
     frame: GridFrame | None = None
     sensor: str | None = None
     following: int = 0
-    backend: str = "auto"
+    backend: str | None = None
 
     def __post_init__(self) -> None:
         if self.following and self.layout != "semantickitti":
@@ -110,6 +110,14 @@ class _OpenJob:
         return CampaignSpec.load(self.path).job(self.number)
 
     @cached_property
+    def backend(self) -> str:
+        """Name of the ray-casting backend."""
+        if self.settings.backend is not None:
+            return self.settings.backend
+        source = Scenario if self.number is None else CampaignSpec
+        return source.load(self.path).pool.backend
+
+    @cached_property
     def sensor(self) -> int:
         """Number of the chosen sensor."""
         names = [carried.name for carried in self.job.survey.mounted_sensors]
@@ -140,7 +148,7 @@ class _OpenJob:
             settings.chosen_grid,
             sensor=self.sensor,
             frame=settings.chosen_frame,
-            backend=settings.backend,
+            backend=self.backend,
             threads=1,  # sweeps are computed in parallel
         )
 
