@@ -84,6 +84,7 @@ def turns_around(mesh, points):
     return total / (4 * np.pi)
 
 
+@pytest.mark.extended
 def test_voxels_with_centers_in_closed_meshes_are_occupied():
     ring = trimesh.creation.torus(2.0, 0.9, 16, 12)
     ball = trimesh.creation.icosphere(1, 1.0)
