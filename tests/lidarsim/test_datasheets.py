@@ -39,7 +39,7 @@ def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name
     model = read_model(name)
     if model.performance is None:
         assert model.sources["performance"].startswith("no available source")
-        with pytest.raises(LidarError, match="Set noise instead"):
+        with pytest.raises(LidarError, match="set `noise` instead"):
             model.datasheet()
         return
     sheet = model.datasheet()
@@ -177,7 +177,7 @@ def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor,
     ("sensor", "says"),
     [
         ({"performance": "datasheet"}, "requires a sensor model"),
-        ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "Set noise instead"),
+        ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "set `noise` instead"),
         ({"model": "velodyne/vlp16", "performance": "typical"}, "datasheet"),
     ],
 )

@@ -184,6 +184,24 @@ def test_the_vehicle_blocks_beams_within_the_minimum_range(folder):
     assert evaluate(close).points.tolist() == [0]
 
 
+def test_notes_name_mounts_at_the_body_and_sensors_without_ranges(folder):
+    body = {"box": [2, 2, 1.5]}
+    mounts = {"inside": [0, 0, 0.7], "flush": [0, 0, 1.5], "roof": [0, 0, 2]}
+    sensors = {
+        "top": {"model": "rings.yaml", "mounts": mounts},
+        "side": {"model": "ouster/os1-32", "columns": 512, "mounts": [0, 1.3, 2]},
+    }
+    one = study(folder, body=body, sensors=sensors, map={"heights_m": [0, 1], "cell_m": 1})
+    notes = " ".join(one.run(workers=1).notes)
+    assert "more than 95% of the beams of top at the mount inside." in notes
+    assert "top is on the surface of the body at the mount flush," in notes
+    assert "Set `performance: datasheet` for side. The data sheet range of top is unknown" in (
+        notes
+    )
+    assert "the score uses the blind area at 1 m" in notes
+    assert "roof" not in notes and "of side at" not in notes
+
+
 @pytest.mark.extended
 def test_targets_in_a_sweep_have_the_points_that_they_have_alone(folder):
     """Many targets around a car, evaluated together and one by one."""

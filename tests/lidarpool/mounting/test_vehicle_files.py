@@ -111,6 +111,15 @@ RANGES = {"x": [0, 1], "y": 0, "z": 1.8}
         ({"targets": {"car": {"weight": 0}}}, "must have a `weight` above 0"),
         ({"traffic": "drive.yaml", "targets": ["car"]}, "`traffic` cannot be combined"),
         ({"rank": {"height_m": 0.5}}, "must be one of the heights in map.heights_m"),
+        ({"sensors": sensors({"low": [0, 0, -1.75]})}, "top: mounts: low: z is -1.75 m"),
+        (
+            {"sensors": {"top": {"model": "vlp16", "ranges": RANGES | {"z": [-0.1, 1]}}}},
+            "top: ranges: z is -0.1 m, but a sensor must be above the ground",
+        ),
+        (
+            {"sensors": sensors([0, 0, 2], performance="datasheet", model="hesai/at128")},
+            "Omit `performance`, and set `noise` instead",
+        ),
         ({"region": {"distances_m": [-1]}}, "region.distances_m"),
         ({"region": {"bearings": 720, "headings_deg": [0] * 60}}, "but the limit is 100,000"),
         ({"sensors": {"top": {"model": "vlp16", "ranges": RANGES | {"x": [1, 0]}}}}, "largest"),
@@ -124,6 +133,21 @@ def test_mistakes_are_explained(changes, says):
     with pytest.raises(LidarError) as error:
         load({"body": "saloon", "sensors": sensors([0, 0, 1.8])} | changes)
     assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sections", "height_m"),
+    [
+        ({}, 0.3),
+        ({"map": {"heights_m": [0, 0.1, 0.3]}}, 0.3),
+        ({"map": {"heights_m": [1, 0]}}, 1),
+        ({"map": {"heights_m": [0]}}, 0),
+        ({"map": {"heights_m": [0, 1]}, "rank": {"height_m": 0}}, 0),
+    ],
+)
+def test_the_score_depends_on_a_height_of_the_map(sections, height_m):
+    data = {"body": "van", "sensors": sensors([0, 0, 3])} | sections
+    assert load(data).ranked_height_m == height_m
 
 
 def test_names_of_mounts_must_agree():

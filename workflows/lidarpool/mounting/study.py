@@ -19,7 +19,6 @@ from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 from lidarsim.schema.declared import declared_values
 from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
-from lidarsim.words import join_names, plural
 from raybeam import RayCaster
 
 from ..run.cluster.worker_map import parallel_map
@@ -30,6 +29,7 @@ from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements
 from .ranking import CandidateResult, MountCandidate, RankingRules, pareto_front, rank_candidates
+from .ranking_notes import ranking_notes
 from .search import CandidateSearch
 from .traffic_placements import traffic_placements
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _WORKER_BYTES = 1 << 30
-_MANY_BLOCKED = 0.5  # share of blocked beams that causes a note
 _CARS = dict(zip(BODIES, MODELS, strict=True))
 
 
@@ -187,7 +186,8 @@ class MountStudy:
         if vehicle.is_search:
             found = [_named(result, f"mount {n}") for n, result in enumerate(found, 1)]
         front = pareto_front(found, self.rules.ranked_height_m)
-        return MountRanking(self, found, front, done, (*self.notes, *_notes(found[0], self)))
+        notes = ranking_notes(found, vehicle, self.placements, self.evaluator.body)
+        return MountRanking(self, found, front, done, (*self.notes, *notes))
 
     @property
     def _batch(self) -> int:
@@ -199,39 +199,6 @@ class MountStudy:
 
 def _named(result: CandidateResult, name: str) -> CandidateResult:
     return replace(result, candidate=MountCandidate(name, result.candidate.mounts))
-
-
-def _notes(best: CandidateResult, study: MountStudy) -> list[str]:
-    """Return notes about the best candidate."""
-    notes = []
-    for name, sensor in best.sensors.items():
-        if sensor.blocked > _MANY_BLOCKED * sensor.beams:
-            notes.append(
-                f"the vehicle blocks {sensor.blocked / sensor.beams:.0%} of the beams of {name} in "
-                "the best candidate. Check whether the mount is inside the body"
-            )
-        elif sensor.blocked_near:
-            notes.append(
-                f"the vehicle blocks {plural(sensor.blocked_near, 'beam')} of {name} in the best "
-                "candidate within the minimum range of the sensor"
-            )
-    without = [name for name in best.sensors if not _has_range_limit(study.vehicle, name)]
-    if without:
-        notes.append(
-            f"reflectance and weather do not limit the range of {join_names(without)}, because no "
-            "detection range is set. Set `performance: datasheet`, or `noise.detection_range_m`"
-        )
-    missing = [t.name for k, t in enumerate(study.placements.targets)
-               if not (study.placements.target == k).any()]  # fmt: skip
-    if missing:
-        notes.append(f"all positions of {', '.join(missing)} overlap the vehicle")
-    return notes
-
-
-def _has_range_limit(vehicle: VehicleFile, name: str) -> bool:
-    """Return whether a sensor has a detection range, which depends on the reflectance."""
-    noise = vehicle.mounted_sensor(name, CENTER).noise or vehicle.noise
-    return noise.detection_range_m is not None
 
 
 def _rounded(mesh: SceneMesh, name: str) -> SceneMesh:

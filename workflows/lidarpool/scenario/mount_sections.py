@@ -50,6 +50,7 @@ from .sections import (
 MAX_CANDIDATES = 10_000  # combinations of mounts
 MAX_POSITIONS = 100_000  # positions and headings of all targets
 MAX_CELLS = 4_000_000  # cells of the blind-area map
+DEFAULT_HEIGHT_M = 0.3  # height whose blind area counts, unless the map lacks it
 _FORM = "A vehicle file contains body:, sensors: and optionally targets:, region: and map:"
 
 
@@ -286,8 +287,8 @@ class RankSection(Section):
     height_m: Annotated[
         float | None,
         about(
-            "height in map.heights_m whose blind area counts (default: the lowest above the "
-            "ground)",
+            f"height in map.heights_m whose blind area counts (default: {DEFAULT_HEIGHT_M:g}, or the "
+            "lowest above the ground if map.heights_m does not contain it)",
             0.3,
             ge=0,
             le=10,
@@ -461,9 +462,13 @@ class VehicleFile(Section):
     @property
     def ranked_height_m(self) -> float:
         """Height of the map whose blind area counts in the score, in meters."""
+        if self.rank.height_m is not None:
+            return self.rank.height_m
         heights = sorted(self.map.heights_m)
+        if DEFAULT_HEIGHT_M in heights:
+            return DEFAULT_HEIGHT_M
         above = [height for height in heights if height > 0]
-        return self.rank.height_m if self.rank.height_m is not None else (above or heights)[0]
+        return (above or heights)[0]
 
     def _check(self) -> None:
         """Raise LidarError if fields cannot be combined or a sensor model is invalid."""
@@ -493,6 +498,7 @@ class VehicleFile(Section):
                 f"rank.height_m is {self.rank.height_m:g}, but must be one of the heights in "
                 f"map.heights_m ({heights})."
             )
+        yield from self._positions_below_ground()
         yield from self._combination_contradictions()
         positions = len(self.targets) * self.region.bearings
         positions *= len(self.region.distances_m) * len(self.region.headings_deg)
@@ -501,6 +507,19 @@ class VehicleFile(Section):
                 f"The targets have {positions:,} positions and headings, but the limit is "
                 f"{MAX_POSITIONS:,}. Reduce `bearings`, `distances_m` or `headings_deg`."
             )
+
+    def _positions_below_ground(self) -> Iterator[str]:
+        """Yield a sentence for each mount or range that is not above the ground."""
+        for name, sensor in self.sensors.items():
+            lowest = {f"mounts: {key}": pose.position[2] for key, pose in sensor.mounts.items()}
+            if sensor.ranges is not None:
+                lowest = {"ranges": sensor.ranges.z[0]}
+            for field, z in lowest.items():
+                if z <= 0:
+                    yield (
+                        f"sensors: {name}: {field}: z is {z:g} m, but a sensor must be above the "
+                        "ground, which is z = 0 in the frame of the vehicle."
+                    )
 
     def _combination_contradictions(self) -> Iterator[str]:
         """Yield a sentence for each mistake in the combination of mounts."""

@@ -354,7 +354,8 @@ class SensorModel(_ModelSection):
         performance = self.performance
         if performance is None:
             raise LidarError(
-                f"No performance values are available for {self.name}. Set noise instead."
+                f"No performance values are available for {self.name}. Omit `performance`, and set "
+                "`noise` instead, which is a top-level section in files."
             )
         min_range_m, max_range_m = self.range_m or (0.0, float("inf"))
         noise = performance.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
