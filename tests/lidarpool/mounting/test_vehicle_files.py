@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -186,6 +187,12 @@ def test_the_ranking_is_written(folder):
     assert [actor.name for actor in best.actors] == ["pedestrian", "car"]
     page = Path("car-mounts/report.html").read_text()
     assert page.count("<svg") >= 5 and "The best candidate is roof." in page
+    assert "left      0.000    0.500    1.600      0.0      0.0      0.0" in outcome.stdout
+    cells = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
+    assert "low right 2.400 −0.600 0.500 0.0 0.0 0.0" in cells
+    for one in figures["candidates"]:
+        shares = " ".join(f"{100 * share:.1f} %" for share in one["detection"].values())
+        assert f"{one['name']} {shares}" in cells
 
     again = mount("car.yaml")
     assert isinstance(again.exception, LidarError) and "already exists" in str(again.exception)

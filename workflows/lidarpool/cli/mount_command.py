@@ -127,6 +127,7 @@ def _lines(result: MountRanking) -> Iterator[str]:
     if len(result.ranked) > 1:
         yield "* on the trade-off curve of detection and blind area"
     yield from _class_lines(result)
+    yield from _mount_lines(result)
     yield from (f"note: {note}" for note in result.notes)
 
 
@@ -142,3 +143,15 @@ def _class_lines(result: MountRanking) -> Iterator[str]:
             f"{printable(name):<{width}} {best.detection[name]:10.1%} "
             f"{best.redundancy[name]:16.1%} {best.mean_points[name]:13,.1f}"
         )
+
+
+def _mount_lines(result: MountRanking) -> Iterator[str]:
+    """Format the mounts of the best candidate as lines of text."""
+    mounts = result.best.candidate.mounts
+    width = max(6, *(len(printable(name)) for name in mounts))
+    head = "".join(f"{word:>9}" for word in ("x", "y", "z", "yaw", "pitch", "roll"))
+    yield f"{'sensor':<{width}}{head}   (m, degrees)"
+    for name, pose in mounts.items():
+        position = "".join(f"{value:9.3f}" for value in pose.position)
+        angles = "".join(f"{v:9.1f}" for v in (pose.yaw_deg, pose.pitch_deg, pose.roll_deg))
+        yield f"{printable(name):<{width}}{position}{angles}"

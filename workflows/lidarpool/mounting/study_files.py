@@ -58,11 +58,20 @@ def write_study(result: MountRanking, folder: Path) -> list[Path]:
         figures = figures_of(result)
         pictures = {name: page.svg() for name, page in draw_all(result).items()}
         report = figures | {"versions": {"lidarpool": __version__}, "name": _title(result)}
+        mounts = [
+            (candidate["name"], name, mount)
+            for candidate in figures["candidates"][:SHOWN_CANDIDATES]
+            for name, mount in candidate["sensors"].items()
+        ]
         texts = {
             SCENARIO_FILE: _scenario(result, folder, files),
             FIGURES_FILE: json.dumps(figures, indent=1, allow_nan=False) + "\n",
             PAGE_FILE: render_template(
-                "mount.html", report=report, pictures=pictures, shown=SHOWN_CANDIDATES
+                "mount.html",
+                report=report,
+                pictures=pictures,
+                shown=SHOWN_CANDIDATES,
+                mounts=mounts,
             ),
         }
         for name, text in texts.items():

@@ -287,8 +287,8 @@ class RankSection(Section):
     height_m: Annotated[
         float | None,
         about(
-            f"height in map.heights_m whose blind area counts (default: {DEFAULT_HEIGHT_M:g}, or the "
-            "lowest above the ground if map.heights_m does not contain it)",
+            f"height in map.heights_m whose blind area counts (default: {DEFAULT_HEIGHT_M:g}, or "
+            "the lowest above the ground if map.heights_m does not contain it)",
             0.3,
             ge=0,
             le=10,
