@@ -486,7 +486,7 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
         ("scene: no.glb", "scene.files[0].file", "no.glb"),
         (
             "scene: seed\nactors: [{name: A, file: no.urdf, at: [1, 1, 0]}]",
-            "actors[0].file.file",
+            "actors[0].file",
             "no.urdf",
         ),
         (

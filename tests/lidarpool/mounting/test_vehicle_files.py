@@ -257,6 +257,16 @@ actors:
 """
 
 
+def test_a_missing_scenario_is_reported_with_its_field(folder):
+    from lidarpool.mounting.study import MountStudy
+
+    Path("file.yaml").write_text("")
+    data = {"body": "saloon", "sensors": sensors([0, 0, 1.8]), "traffic": "drive.yaml"}
+    with pytest.raises(LidarError) as raised:
+        MountStudy.from_file(load(data))
+    assert str(raised.value) == "vehicle file: traffic.scenario: drive.yaml does not exist."
+
+
 @pytest.mark.extended
 def test_traffic_is_in_the_report(folder):
     Path("drive.yaml").write_text(DRIVE)

@@ -41,13 +41,15 @@ def traffic_placements(vehicle: VehicleFile, section: TrafficTargets) -> Placeme
     LidarError
         If the scenario has no trajectory, or if no actor comes close enough.
     """
-    scenario = Scenario.load(vehicle.files.path(section.scenario))
+    field = f"{vehicle.source}: traffic.scenario"
+    with prefix_errors(field):
+        scenario = Scenario.load(vehicle.files.path(section.scenario))
     if scenario.trajectory is None:
         raise LidarError(
-            f"{scenario.source} has no trajectory, which `traffic` requires. Set `trajectory`, or "
+            f"{field}: {scenario.source} has no trajectory, which `traffic` requires. Set `trajectory`, or "
             "use `region` instead."
         )
-    with prefix_errors(vehicle.source):
+    with prefix_errors(field):
         prepared = prepare(scenario, plans=False)
     platform = _platform_path(prepared, section)
     classes = dict(section.classes) or {_ALL: ("*",)}

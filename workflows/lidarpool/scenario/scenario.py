@@ -520,7 +520,8 @@ def _find_file_field(section: Any, is_file: Callable[[str], bool]) -> str:
     """
     for path, text in _iter_strings(section):
         if path[-1] in _FILE_FIELDS and is_file(text):
-            return format_path(path)
+            # `file: a.glb` is a short form of `file: {file: a.glb}`.
+            return format_path(path[:-1] if path[-2:] == ("file", "file") else path)
     return ""
 
 

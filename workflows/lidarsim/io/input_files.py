@@ -15,7 +15,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from ..errors import LidarError
-from ..words import did_you_mean
+from ..words import did_you_mean, most_similar
 from .allowance import bytes_of, memory
 
 # Opening a pipe blocks until there is a writer, and opening a terminal may make it the controlling
@@ -83,7 +83,13 @@ def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
     with suppress(OSError):
         names = [entry.name for entry in file.parent.iterdir()]
     likely = tuple(endings) or (file.suffix.lower(),)
-    hint = did_you_mean(file.name, [name for name in names if name.lower().endswith(likely)])
+    # Equal endings alone do not make names similar.
+    similar = [
+        name
+        for name in names
+        if name.lower().endswith(likely) and most_similar(file.stem, [Path(name).stem])
+    ]
+    hint = did_you_mean(file.name, similar)
     return f"{path} does not exist.{hint}"
 
 
