@@ -194,7 +194,7 @@ def test_notes_name_mounts_at_the_body_and_sensors_without_ranges(folder):
     one = study(folder, body=body, sensors=sensors, map={"heights_m": [0, 1], "cell_m": 1})
     notes = " ".join(one.run(workers=1).notes)
     assert "more than 95% of the beams of top at the mount inside." in notes
-    assert "top is on the surface of the body at the mount flush," in notes
+    assert "at the mount flush, top is on the surface of the body," in notes
     assert "Set `performance: datasheet` for side. The data sheet range of top is unknown" in (
         notes
     )

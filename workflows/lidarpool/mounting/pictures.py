@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, to_rgb
 from matplotlib.patheffects import withStroke
 from matplotlib.projections.polar import PolarAxes
+from matplotlib.transforms import Bbox
 
+from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.words import shorten_name
 from lidarview.render import theme
@@ -21,6 +24,18 @@ from .evaluation import SHARE_DEG
 from .ranking import CandidateResult, points_by_position
 from .study import MountRanking, MountStudy
 
+_MAX_LABELS = 12  # labeled candidates on the trade-off curve
+# Offsets of a label from its point, and its alignment.
+_LABEL_SIDES = (
+    (0, 5, "center", "bottom"),
+    (0, -5, "center", "top"),
+    (5, 0, "left", "center"),
+    (-5, 0, "right", "center"),
+    (5, 7, "left", "bottom"),
+    (-5, 7, "right", "bottom"),
+    (5, -7, "left", "top"),
+    (-5, -7, "right", "top"),
+)
 MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
 _SIZE = (1600, 1200)
 # Layout of pages with several charts, pixels.
@@ -29,10 +44,10 @@ _TOP = 190
 _GAP = 110  # between rows of charts
 _PANELS_WIDTH = 1340
 # Colors from "visible on the ground" to "an object of the largest height is hidden".
-_BANDS = ("#eef3f7", "#fddbc7", "#f4a582", "#d6604d", "#b2182b", "#8e0c25", "#67001f", "#4d0018",
-          "#33000f")  # fmt: skip
+_BANDS = ("#eef3f7", "#d8daeb", "#b2abd2", "#8073ac", "#542788", "#46207a", "#381868", "#2d004b",
+          "#1c0030")  # fmt: skip
 _VEHICLE = "#7d8794"
-_COUNTS = ("#b2182b", "#d1e5f0", "#67a9cf", "#2166ac")  # cells seen by 0, 1, 2, and more sensors
+_COUNTS = ("#e08214", "#d1e5f0", "#67a9cf", "#2166ac")  # cells seen by 0, 1, 2, and more sensors
 _FRONT = "#d6336c"
 _OTHER = "#5b8fd0"
 
@@ -100,8 +115,8 @@ def draw_comparison(result: MountRanking) -> Page:
         axes = page.chart(frame)
         _draw_map(page, axes, result.study, _bands(result.study, candidate), colors)
         _mark_sensors(page, axes, candidate, named=False)
-        name = shorten_name(candidate.candidate.name, 30)
-        page.heading(axes, f"{name}: {candidate.blind_m2[height]:,.1f} m² at {height:g} m")
+        name = shorten_name(candidate.candidate.name, 36)
+        page.heading(axes, f"{name}\n{candidate.blind_m2[height]:,.1f} m² at {height:g} m")
         axes.set_ylabel("")
     page.legend([*zip(_band_names(result.study), colors, strict=True)], "sensor")
     page.title(
@@ -176,9 +191,12 @@ def draw_detection(result: MountRanking) -> Page:
             continue
         distances, shares = _by_distance(placements.distances_m[rows], detected[rows])
         color = theme.OBJECT_COLORS[number % len(theme.OBJECT_COLORS)]
+        # Later lines are thinner, so that equal lines remain visible.
+        width = 1.4 + 3.6 * (1 - (number + 1) / len(placements.targets))
         (line,) = axes.plot(
-            distances, shares, "o-", color=color, lw=1.6 * page.unit, ms=3.5 * page.unit
-        )
+            distances, shares, "o-", color=color, lw=width * page.unit,
+            ms=(width + 2.2) * page.unit, mew=0,
+        )  # fmt: skip
         line.set_label(shorten_name(f"{target.name} (≥ {target.points})", 28))
         handles.append(line)
     page.key(handles, 6.6, bbox_to_anchor=(0.43, 0.45))
@@ -202,21 +220,40 @@ def _draw_tradeoff(page: Page, result: MountRanking) -> None:
     order = np.flatnonzero(front)[np.argsort(blind[front], kind="stable")]
     axes.plot(blind[order], rates[order], "o-", color=_FRONT, ms=5 * page.unit, lw=1.4 * page.unit)
     axes.margins(0.18)
-    halo = [withStroke(linewidth=2 * page.unit, foreground=theme.GROUND)]
-    for index in range(min(len(result.ranked), MAX_PANELS)):
-        axes.annotate(
-            shorten_name(result.ranked[index].candidate.name, 24),
-            (float(blind[index]), float(rates[index])),
-            xytext=(0, 6 * page.unit),
-            textcoords="offset points",
-            ha="center",
-            fontsize=6.4 * page.unit,
-            color=theme.INK,
-            family=FONT,
-            path_effects=halo,
-            parse_math=False,
-        )
+    labels = dict.fromkeys([*order[:_MAX_LABELS].tolist(), *range(MAX_PANELS)])
+    points = {
+        shorten_name(result.ranked[index].candidate.name, 24): (blind[index], rates[index])
+        for index in labels
+        if index < len(result.ranked)
+    }
+    _label_points(page, axes, points)
     page.heading(axes, "Candidates; the trade-off curve is red")
+
+
+def _label_points(page: Page, axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
+    """Label points at the first side that is free. Points without a free side have no label."""
+    halo = [withStroke(linewidth=2 * page.unit, foreground=theme.GROUND)]
+    canvas = FigureCanvasAgg(page.figure)
+    canvas.draw()
+    frame = axes.get_window_extent(canvas.get_renderer())
+    taken = [
+        Bbox.from_extents(x - 1, y - 1, x + 1, y + 1)
+        for x, y in axes.transData.transform([*points.values()])
+    ]
+    for name, point in points.items():
+        for x, y, horizontal, vertical in _LABEL_SIDES:
+            label = axes.annotate(
+                name, point, xytext=(x * page.unit, y * page.unit), textcoords="offset points",
+                ha=horizontal, va=vertical, fontsize=6.4 * page.unit, color=theme.INK, family=FONT,
+                path_effects=halo, parse_math=False,
+            )  # fmt: skip
+            extent = label.get_window_extent(canvas.get_renderer())
+            inside = frame.x0 <= extent.x0 and extent.x1 <= frame.x1
+            inside = inside and frame.y0 <= extent.y0 and extent.y1 <= frame.y1
+            if inside and not extent.count_overlaps(taken):
+                taken.append(extent)
+                break
+            label.remove()
 
 
 def _by_distance(distances: Floats, values: Bools) -> tuple[Floats, Floats]:
@@ -255,10 +292,28 @@ def draw_blocked(result: MountRanking) -> Page:
         )  # fmt: skip
         axes.grid(False)
         axes.set_xlabel("azimuth in the sensor frame, ° (positive is left)")
+        _mark_directions(page, axes, result.best.candidate.mounts[name])
         page.heading(axes, f"{name}: {sensor.blocked / sensor.beams:.1%} of the beams are blocked")
     page.legend([("free", "#d1e5f0"), ("blocked", "#b2182b"), ("no beams", theme.UNSEEN)], "")
     page.title("Occlusion by the vehicle")
     return page
+
+
+def _mark_directions(page: Page, axes: Axes, mount: Pose) -> None:
+    """Mark the azimuths of the vehicle's front and rear in the frame of a sensor."""
+    forward = mount.rotation_matrix[0]
+    front = float(np.degrees(np.arctan2(forward[1], forward[0])))
+    halo = [withStroke(linewidth=2 * page.unit, foreground=theme.PAGE)]
+    top = axes.get_ylim()[1]
+    for azimuth, word in ((front, "front"), (front + 180, "rear")):
+        azimuth = (azimuth + 180) % 360 - 180
+        offset = -3 if azimuth < -150 else 3
+        axes.axvline(azimuth, color=theme.INK, lw=0.8 * page.unit, ls="--")
+        axes.annotate(
+            word, (azimuth, top), xytext=(offset * page.unit, -3 * page.unit),
+            ha="right" if offset < 0 else "left", va="top", textcoords="offset points",
+            fontsize=6.4 * page.unit, color=theme.INK, family=FONT, path_effects=halo,
+        )  # fmt: skip
 
 
 def _bands(study: MountStudy, candidate: CandidateResult) -> Ints:
@@ -271,8 +326,10 @@ def _bands(study: MountStudy, candidate: CandidateResult) -> Ints:
 def _band_names(study: MountStudy) -> list[str]:
     """Return the legend entries of the bands."""
     heights = study.rules.heights_m
-    words = ["ground" if height == 0 else f"{height:g} m" for height in heights]
-    return [f"{word} visible" for word in words] + [f"{heights[-1]:g} m blind"]
+    words = [
+        "ground visible" if height == 0 else f"visible from {height:g} m" for height in heights
+    ]
+    return [*words, f"blind to {heights[-1]:g} m"]
 
 
 def _band_colors(study: MountStudy) -> tuple[str, ...]:

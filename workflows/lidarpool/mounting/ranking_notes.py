@@ -61,8 +61,8 @@ def _body_notes(
         touching = [pose for pose in poses if _is_on_surface(pose, body)]
         if touching:
             yield (
-                f"{name} is on the surface of the body at "
-                f"{_mount_names(touching, sensor.mounts)}, so many of its beams start inside the "
+                f"at {_mount_names(touching, sensor.mounts)}, {name} is on the surface of the "
+                "body, so many of its beams start inside the "
                 "body. The position is the origin of the sensor, which is above its base"
             )
         inside = [

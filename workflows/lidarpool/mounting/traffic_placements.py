@@ -46,8 +46,8 @@ def traffic_placements(vehicle: VehicleFile, section: TrafficTargets) -> Placeme
         scenario = Scenario.load(vehicle.files.path(section.scenario))
     if scenario.trajectory is None:
         raise LidarError(
-            f"{field}: {scenario.source} has no trajectory, which `traffic` requires. Set `trajectory`, or "
-            "use `region` instead."
+            f"{field}: {scenario.source} has no trajectory, which `traffic` requires. Set "
+            "`trajectory`, or use `region` instead."
         )
     with prefix_errors(field):
         prepared = prepare(scenario, plans=False)

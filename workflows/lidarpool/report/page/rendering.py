@@ -262,6 +262,7 @@ def _template(name: str) -> Template:
         numbers,
         format_value,
         code,
+        code_spans,
         escape_markdown,
         millimeters,
         ratio,
@@ -411,6 +412,17 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
     first = note.partition(" ")[0].rstrip(",:;")
     is_name = not (first.isalpha() and first.islower()) or note.startswith((*filter(None, names),))
     return note if is_name else f"{note[:1].upper()}{note[1:]}"
+
+
+def code_spans(text: str) -> Markup:
+    """Format the names between backticks in a message as code.
+
+    Examples
+    --------
+    >>> code_spans("set `a: 1`, if x < 2")
+    Markup('set <code>a: 1</code>, if x &lt; 2')
+    """
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(printable(text)))))
 
 
 def printable(text: str) -> str:
