@@ -195,9 +195,7 @@ def test_notes_name_mounts_at_the_body_and_sensors_without_ranges(folder):
     notes = " ".join(one.run(workers=1).notes)
     assert "more than 95% of the beams of top at the mount inside." in notes
     assert "at the mount flush, top is on the surface of the body," in notes
-    assert "Set `performance: datasheet` for side. The data sheet range of top is unknown" in (
-        notes
-    )
+    assert "Set `performance: datasheet` for side. No data sheet range is known for top" in (notes)
     assert "the score uses the blind area at 1 m" in notes
     assert "roof" not in notes and "of side at" not in notes
 

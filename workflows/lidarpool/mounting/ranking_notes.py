@@ -130,7 +130,7 @@ def _range_notes(vehicle: VehicleFile) -> Iterator[str]:
         advice.append(f"Set `performance: datasheet` for {join_names(with_sheet)}")
     if others:
         advice.append(
-            f"The data sheet range of {join_names(others)} is unknown. Set "
+            f"No data sheet range is known for {join_names(others)}. Set "
             "`noise.detection_range_m` next to `sensors` to the range at 10 % reflectance. It "
             "applies to all sensors, and overrides their data sheets"
         )
