@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -27,14 +27,14 @@ from .study import MountRanking, MountStudy
 _MAX_LABELS = 12  # labeled candidates on the trade-off curve
 # Offsets of a label from its point, and its alignment.
 _LABEL_SIDES = (
+    (-3, 3, "right", "bottom"),
     (0, 5, "center", "bottom"),
-    (0, -5, "center", "top"),
     (5, 0, "left", "center"),
     (-5, 0, "right", "center"),
-    (5, 7, "left", "bottom"),
-    (-5, 7, "right", "bottom"),
-    (5, -7, "left", "top"),
-    (-5, -7, "right", "top"),
+    (0, -5, "center", "top"),
+    (3, 3, "left", "bottom"),
+    (3, -3, "left", "top"),
+    (-3, -3, "right", "top"),
 )
 MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
 _SIZE = (1600, 1200)
@@ -220,37 +220,42 @@ def _draw_tradeoff(page: Page, result: MountRanking) -> None:
     order = np.flatnonzero(front)[np.argsort(blind[front], kind="stable")]
     axes.plot(blind[order], rates[order], "o-", color=_FRONT, ms=5 * page.unit, lw=1.4 * page.unit)
     axes.margins(0.18)
-    labels = dict.fromkeys([*order[:_MAX_LABELS].tolist(), *range(MAX_PANELS)])
-    points = {
-        shorten_name(result.ranked[index].candidate.name, 24): (blind[index], rates[index])
-        for index in labels
-        if index < len(result.ranked)
-    }
-    _label_points(page, axes, points)
+    best = range(min(len(result.ranked), MAX_PANELS))
+    labels = dict.fromkeys([*order[:_MAX_LABELS].tolist(), *best])
+    names = {index: result.ranked[index].candidate.name for index in labels}
+    _label_points(page, axes, np.column_stack([blind, rates]), names, set(order.tolist()))
     page.heading(axes, "Candidates; the trade-off curve is red")
 
 
-def _label_points(page: Page, axes: Axes, points: Mapping[str, tuple[float, float]]) -> None:
-    """Label points at the first side that is free. Points without a free side have no label."""
+def _label_points(
+    page: Page, axes: Axes, points: Floats, names: Mapping[int, str], required: Set[int]
+) -> None:
+    """Label points at the first side without other labels and points.
+
+    Points of shape (n, 2) are labeled if they have a name. Labels in `required` may cover other
+    points, and other labels are omitted if no side is free.
+    """
     halo = [withStroke(linewidth=2 * page.unit, foreground=theme.GROUND)]
     canvas = FigureCanvasAgg(page.figure)
     canvas.draw()
     frame = axes.get_window_extent(canvas.get_renderer())
-    taken = [
-        Bbox.from_extents(x - 1, y - 1, x + 1, y + 1)
-        for x, y in axes.transData.transform([*points.values()])
-    ]
-    for name, point in points.items():
-        for x, y, horizontal, vertical in _LABEL_SIDES:
+    radius = 3 * page.unit * page.figure.dpi / 72
+    dots = [Bbox([dot - radius, dot + radius]) for dot in axes.transData.transform(points)]
+    taken: list[Bbox] = []
+    for index, name in names.items():
+        attempts = [(side, [*taken, *dots]) for side in _LABEL_SIDES]
+        if index in required:
+            attempts += [(side, taken) for side in _LABEL_SIDES]
+        for (x, y, horizontal, vertical), obstacles in attempts:
             label = axes.annotate(
-                name, point, xytext=(x * page.unit, y * page.unit), textcoords="offset points",
-                ha=horizontal, va=vertical, fontsize=6.4 * page.unit, color=theme.INK, family=FONT,
-                path_effects=halo, parse_math=False,
+                shorten_name(name, 24), points[index], xytext=(x * page.unit, y * page.unit),
+                textcoords="offset points", ha=horizontal, va=vertical, fontsize=6.4 * page.unit,
+                color=theme.INK, family=FONT, path_effects=halo, parse_math=False,
             )  # fmt: skip
             extent = label.get_window_extent(canvas.get_renderer())
-            inside = frame.x0 <= extent.x0 and extent.x1 <= frame.x1
-            inside = inside and frame.y0 <= extent.y0 and extent.y1 <= frame.y1
-            if inside and not extent.count_overlaps(taken):
+            is_inside = frame.containsx(extent.x0) and frame.containsx(extent.x1)
+            is_inside = is_inside and frame.containsy(extent.y0) and frame.containsy(extent.y1)
+            if is_inside and not extent.count_overlaps(obstacles):
                 taken.append(extent)
                 break
             label.remove()
