@@ -17,8 +17,9 @@ from lidarpool.plan.flight import plan_flight
 from lidarpool.plan.flight_area import read_area, transform_shape
 from lidarpool.plan.flight_density import (
     DensityMap,
+    Squares,
     expected_density,
-    is_inside,
+    is_inside_grid,
     summarize_density,
 )
 from lidarpool.plan.flight_files import to_geojson, to_kml
@@ -225,19 +226,56 @@ def test_the_expected_density_is_that_of_a_simulation():
     counts = np.zeros(shape[::-1])
     np.add.at(counts, (row[inside], column[inside]), 1)
     assert expected.density_m2 == pytest.approx(counts / expected.cell_m**2, rel=0.01)
-    summary = summarize_density(expected, area, 2.0)
+    summary = summarize_density(expected, 2.0)
     assert summary.mean_m2 == pytest.approx(inside.sum() / (120 * 160), rel=0.02)
     assert summary.low_m2 < summary.mean_m2
 
 
 def test_areas_with_holes():
     area = [[(0, 0), (10, 0), (10, 10), (0, 10)], [(4, 4), (6, 4), (6, 6), (4, 6)]]
-    points = np.array([[5.0, 5], [1, 1], [5, 7], [-1, 5], [11, 5]])
-    assert is_inside(points, area).tolist() == [False, True, True, False, False]
-    grid = DensityMap(np.arange(100.0).reshape(10, 10), np.zeros(2), 1.0)
-    within = grid.within(area)
-    assert len(within) == 96
-    assert not {44.0, 45, 54, 55} & {*within.tolist()}
+    x, y = np.array([-1.0, 1, 5, 11]), np.array([1.0, 5, 7])
+    assert is_inside_grid(x, y, area).tolist() == [
+        [False, True, True, False],
+        [False, True, False, False],
+        [False, True, True, False],
+    ]
+    grid = DensityMap.from_squares(Squares(np.ones((10, 10)), np.zeros(2), 1.0), area, 5.0)
+    assert grid.density_m2 == pytest.approx(np.ones((2, 2)))
+    assert grid.covered == pytest.approx(np.full((2, 2), 0.96))
+
+
+def squares_with_density(density, side_m=0.37, corner=(-7.0, -9.0), shape=(400, 400)):
+    """Squares that are not aligned with the area, with a density that depends on x."""
+    x = corner[0] + (np.arange(shape[1]) + 0.5) * side_m
+    counts = np.broadcast_to(density(x), shape) * side_m**2
+    return Squares(counts, np.array(corner), side_m)
+
+
+@pytest.mark.parametrize(
+    ("corners", "mean_m2", "low_m2"),
+    [
+        ([(0, 0), (100, 0), (100, 60), (0, 60)], 50, 5),
+        ([(0, 0), (100, 0), (100, 100)], 200 / 3, 100 * 0.05**0.5),
+    ],
+)
+def test_the_density_of_an_area_includes_its_border(corners, mean_m2, low_m2):
+    # The density is x. Beyond the border, it is not.
+    squares = squares_with_density(lambda x: np.where(x > 0, np.where(x < 100, x, 7e4), 0))
+    for cell_m in (2.0, 5.0):
+        found = summarize_density(DensityMap.from_squares(squares, [corners], cell_m), mean_m2)
+        assert found.cell_m == cell_m
+        assert found.mean_m2 == pytest.approx(mean_m2, rel=0.005)
+        assert found.low_m2 == pytest.approx(low_m2, abs=cell_m / 2 + 0.5)
+        assert found.empty == 0
+    assert found.reached == pytest.approx(0.5 if low_m2 == 5 else 5 / 9, abs=0.03)
+
+
+def test_a_part_of_an_area_without_squares_is_empty():
+    squares = squares_with_density(lambda x: 0 * x + 4)  # up to x = 141
+    area = [[(0, 0), (282, 0), (282, 60), (0, 60)]]
+    found = summarize_density(DensityMap.from_squares(squares, area, 5.0), 4.0)
+    assert found.empty == pytest.approx(0.5, abs=0.02)
+    assert found.mean_m2 == pytest.approx(2, rel=0.01)
 
 
 def test_areas_from_text_and_files(tmp_path):

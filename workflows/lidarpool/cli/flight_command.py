@@ -308,7 +308,7 @@ def _area_name(area: str) -> str:
 
 def _write_plan(
     plan: FlightPlan, site: _Site, folder: Path, terminal: Terminal
-) -> AreaDensity | None:
+) -> AreaDensity:
     """Write all files of a plan, and return the expected density in the area."""
     from ..clouds.folder import staging
     from ..plan.flight_density import expected_density, summarize_density
@@ -331,7 +331,7 @@ def _write_plan(
             scene = prepared.scene.with_world_origin((0, 0, 0))
             area = data["flight"]["area"]
             expected = expected_density(scene, prepared.survey, area)
-            density = summarize_density(expected, area, data["flight"]["density_m2"])
+            density = summarize_density(expected, data["flight"]["density_m2"])
         text = _head(plan, density) + _yaml(data)
         (staged / SCENARIO_FILE).write_text(text, "utf-8", newline="\n")
         geojson = to_geojson(plan, site.epsg, site.origin)
@@ -423,13 +423,13 @@ def _path_text(plan: FlightPlan) -> str:
     return "time_s,x,y,z,yaw_deg,pitch_deg,roll_deg\n" + "".join(lines)
 
 
-def _head(plan: FlightPlan, density: AreaDensity | None) -> str:
+def _head(plan: FlightPlan, density: AreaDensity) -> str:
     """Return the comments at the beginning of the scenario."""
     summary = " ".join(_summary(plan, density))
     return comment_lines([summary, *(f"Note: {note}." for note in plan.notes)])
 
 
-def _summary(plan: FlightPlan, density: AreaDensity | None) -> Iterator[str]:
+def _summary(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
     """Yield sentences about the lines, the rates and the density."""
     scanner = plan.scanner
     spacing = "" if plan.spacing_m is None else f", {plan.spacing_m:.1f} m apart"
@@ -441,21 +441,14 @@ def _summary(plan: FlightPlan, density: AreaDensity | None) -> Iterator[str]:
         f"{scanner.sensor.model}: {format_rounded(plan.rates.fired_hz / 1000)} kHz, "
         f"{plan.rates.scan_hz:g} Hz, a swath of {plan.swath_m:.0f} m at {plan.layout.agl_m:g} m."
     )
-    if density is not None:
-        yield (
-            f"Expected density: {density.mean_m2:.3g} points per m² on average, at least "
-            f"{density.low_m2:.3g} in 95 % of the area."
-        )
+    yield (
+        f"Expected density: {density.mean_m2:.3g} points per m² on average, at least "
+        f"{density.low_m2:.3g} in 95 % of the area."
+    )
 
 
-def _density_notes(plan: FlightPlan, density: AreaDensity | None) -> Iterator[str]:
+def _density_notes(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
     """Yield a note if a part of the area has fewer points than planned."""
-    if density is None:
-        yield (
-            "The density cannot be estimated, because the area is smaller than a cell of the "
-            "density map. Plan a larger area or a higher density"
-        )
-        return
     if density.empty > 0:
         yield (
             f"{max(density.empty, 0.001):.1%} of the area has no points in cells of "
@@ -472,7 +465,7 @@ def _density_notes(plan: FlightPlan, density: AreaDensity | None) -> Iterator[st
         )
 
 
-def _lines(plan: FlightPlan, density: AreaDensity | None, notes: list[str]) -> Iterator[str]:
+def _lines(plan: FlightPlan, density: AreaDensity, notes: list[str]) -> Iterator[str]:
     """Format a plan as lines of text."""
     yield from _summary(plan, density)
     low, high = plan.densities_m2
@@ -497,7 +490,7 @@ def _lines(plan: FlightPlan, density: AreaDensity | None, notes: list[str]) -> I
 
 
 def _figures(
-    plan: FlightPlan, site: _Site, density: AreaDensity | None, notes: list[str]
+    plan: FlightPlan, site: _Site, density: AreaDensity, notes: list[str]
 ) -> dict[str, Any]:
     """Return a flight plan as a dictionary for JSON."""
     return {
@@ -509,7 +502,7 @@ def _figures(
         "spacing_m": plan.spacing_m,
         "min_overlap": plan.min_overlap,
         "strip_density_m2": list(plan.densities_m2),
-        "density": density and density._asdict(),
+        "density": density._asdict(),
         "duration_s": plan.duration_s,
         "length_m": plan.length_m,
         "lines": [

@@ -136,8 +136,7 @@ def _flight_figures(prepared: PreparedScenario) -> dict[str, Any] | None:
         return None
     scene = prepared.scene.with_world_origin((0, 0, 0))
     expected = expected_density(scene, prepared.survey, plan.area)
-    density = summarize_density(expected, plan.area, plan.density_m2)
-    return density and density._asdict()
+    return summarize_density(expected, plan.density_m2)._asdict()
 
 
 def _check_existing(job: Job, out: Path | Storage) -> None:

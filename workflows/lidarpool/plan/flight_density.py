@@ -21,27 +21,72 @@ Ring = Sequence[tuple[float, float]]
 SAMPLED_RAYS = 600_000
 CELL_POINTS = 80  # mean number of points, sampled or simulated, in a cell of a density map
 _GOLDEN = 0.6180339887498949  # golden ratio minus 1
-_CORNERS = (0.01, 0.99)  # positions in a cell that are close to its corners
+_SQUARES_PER_CELL = 10  # squares along each side of a cell
+_MIN_COVERED = 0.25  # smaller parts of cells contain too few points
+
+
+class Squares(NamedTuple):
+    """Number of points in the squares of a fine horizontal grid."""
+
+    counts: Floats | Ints  # (rows, columns), southernmost row first
+    corner: Floats  # (2,), southwest corner in world coordinates, meters
+    side_m: float
+
+    def over(self, area: Sequence[Ring]) -> Squares:
+        """Return the squares of the same grid that cover the bounding box of an area."""
+        lower, upper = _bounds(area)
+        first, stop = (
+            rounded((limit - self.corner) / self.side_m).astype(int)
+            for rounded, limit in ((np.floor, lower), (np.ceil, upper))
+        )
+        counts = np.zeros(np.maximum(stop - first, 1)[::-1], self.counts.dtype)
+        low = np.maximum(first, 0)
+        high = np.maximum(np.minimum(stop, self.counts.shape[::-1]), low)
+        rows, columns = (slice(*limits) for limits in zip(low[::-1], high[::-1], strict=True))
+        known = self.counts[rows, columns]
+        to = low - first
+        counts[to[1] : to[1] + known.shape[0], to[0] : to[0] + known.shape[1]] = known
+        return Squares(counts, self.corner + first * self.side_m, self.side_m)
 
 
 class DensityMap(NamedTuple):
-    """Number of points per square meter in the square cells of a horizontal grid."""
+    """Number of points per square meter in the square cells of a horizontal grid.
 
-    density_m2: Floats  # (rows, columns), southernmost row first
+    Only the points and the parts of the cells that are in the area are counted.
+    """
+
+    density_m2: Floats  # (rows, columns), southernmost row first, NaN outside the area
+    covered: Floats  # (rows, columns), share of each cell that is in the area
     corner: Floats  # (2,), southwest corner in world coordinates, meters
     cell_m: float  # side of a cell
 
-    def within(self, area: Sequence[Ring]) -> Floats:
-        """Return the densities of the cells that are completely in an area, with shape (n,)."""
-        inside = np.ones(self.density_m2.size, np.bool_)
-        for east, north in ((0.5, 0.5), *((x, y) for x in _CORNERS for y in _CORNERS)):
-            rows, columns = self.density_m2.shape
-            x, y = np.meshgrid(
-                self.corner[0] + (np.arange(columns) + east) * self.cell_m,
-                self.corner[1] + (np.arange(rows) + north) * self.cell_m,
-            )
-            inside &= is_inside(np.column_stack([x.ravel(), y.ravel()]), area)
-        return np.asarray(self.density_m2.ravel()[inside])
+    @classmethod
+    def from_squares(cls, squares: Squares, area: Sequence[Ring], least_m: float) -> DensityMap:
+        """Combine squares whose centers are in an area to cells of at least `least_m` meters.
+
+        The southwest corner of the cells is that of the bounding box of the area.
+        """
+        squares = squares.over(area)
+        lower, upper = _bounds(area)
+        cell_m = nice_cell_m(max(least_m, squares.side_m))
+        shape = np.maximum(np.ceil((upper - lower) / cell_m - 1e-9).astype(int), 1)
+        x, y = (
+            squares.corner[axis] + (np.arange(count) + 0.5) * squares.side_m
+            for axis, count in enumerate(squares.counts.shape[::-1])
+        )
+        inside = is_inside_grid(x, y, area)
+        column, row = (
+            np.clip(np.floor((values - lower[axis]) / cell_m).astype(int), 0, shape[axis] - 1)
+            for axis, values in enumerate((x, y))
+        )
+        cell = (row[:, None] * shape[0] + column)[inside]
+        total = int(shape.prod())
+        covered_m2 = np.bincount(cell, minlength=total) * squares.side_m**2
+        points = np.bincount(cell, squares.counts[inside], total)
+        density = np.full(total, np.nan)
+        np.divide(points, covered_m2, out=density, where=covered_m2 > 0)
+        covered = np.minimum(covered_m2 / cell_m**2, 1.0)
+        return cls(density.reshape(shape[::-1]), covered.reshape(shape[::-1]), lower, cell_m)
 
 
 class AreaDensity(NamedTuple):
@@ -55,41 +100,59 @@ class AreaDensity(NamedTuple):
     cell_m: float  # side of the cells to which the last three values refer
 
 
-def summarize_density(
-    found: DensityMap, area: Sequence[Ring], planned_m2: float
-) -> AreaDensity | None:
+def summarize_density(found: DensityMap, planned_m2: float) -> AreaDensity:
     """Compare the densities in an area with the planned density.
 
-    Returns None if no cell is completely in the area.
+    Cells are weighted by their area within the planned area. Cells of which less than a quarter is
+    in the area only contribute to the mean, because they contain few points.
     """
-    densities = found.within(area)
-    if not len(densities):
-        return None
+    inside = found.covered > 0
+    densities = found.density_m2[inside]
+    weights = found.covered[inside]
+    mean_m2 = float(np.average(densities, weights=weights))
+    large = weights >= min(_MIN_COVERED, weights.max())
+    order = np.argsort(densities[large], kind="stable")
+    densities, weights = densities[large][order], weights[large][order]
+    weights /= weights.sum()
     return AreaDensity(
         planned_m2,
-        float(densities.mean()),
-        float(np.quantile(densities, 0.05)),
-        float((densities >= planned_m2).mean()),
-        float((densities == 0).mean()),
+        mean_m2,
+        float(densities[np.searchsorted(np.cumsum(weights), 0.05)]),
+        float(weights[densities >= planned_m2].sum()),
+        float(weights[densities == 0].sum()),
         found.cell_m,
     )
 
 
-def is_inside(points: Floats, area: Sequence[Ring]) -> Bools:
-    """Return whether points of shape (n, 2) are in an area.
+def is_inside_grid(x: Floats, y: Floats, area: Sequence[Ring]) -> Bools:
+    """Return which points of a grid are in an area, by the even-odd rule.
 
-    The area is bounded by closed rings, of which the inner ones are holes (even-odd rule).
+    For `x` of shape (n,) and `y` of shape (m,), both in ascending order, the result has shape
+    (m, n).
+
+    Examples
+    --------
+    >>> is_inside_grid(np.arange(3.0), np.arange(2.0), [[(0.5, -1), (5, -1), (5, 1), (0.5, 1)]])
+    array([[False,  True,  True],
+           [False, False, False]])
     """
-    x, y = points.T
-    inside = np.zeros(len(points), np.bool_)
+    # An edge that crosses a row toggles all points to its left.
+    toggles = np.zeros((len(y), len(x) + 1), np.int32)
     for ring in area:
         corners = np.asarray(ring, np.float64)
         for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            if y0 == y1:
-                continue
-            crosses = (y0 > y) != (y1 > y)
-            inside ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
-    return inside
+            first, stop = np.searchsorted(y, sorted((y0, y1)))
+            if first < stop:
+                crossings = x0 + (y[first:stop] - y0) * (x1 - x0) / (y1 - y0)
+                toggles[np.arange(first, stop), np.searchsorted(x, crossings)] += 1
+    to_the_right = toggles[:, ::-1].cumsum(axis=1)[:, ::-1]
+    return np.asarray(to_the_right[:, 1:] % 2 == 1)
+
+
+def _bounds(area: Sequence[Ring]) -> tuple[Floats, Floats]:
+    """Return the lower and upper bounds of an area, with shape (2,)."""
+    corners = np.concatenate([np.asarray(ring, np.float64) for ring in area])
+    return corners.min(axis=0), corners.max(axis=0)
 
 
 def expected_density(scene: Scene, survey: Survey, area: Sequence[Ring]) -> DensityMap:
@@ -109,12 +172,10 @@ def expected_density(scene: Scene, survey: Survey, area: Sequence[Ring]) -> Dens
     caster = RayCaster(static.vertices, static.faces)
     every = max(1, -(-survey.ray_count // SAMPLED_RAYS))
     points = []
-    weights = []
     for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True):
         hits = _sampled_hits(caster, survey, mounted, steps, every)
         points.append(hits[:, :2] + scene.origin[:2])
-        weights.append(np.full(len(hits), float(every)))
-    return _count_cells(np.concatenate(points), np.concatenate(weights), area)
+    return _count_in_area(np.concatenate(points), float(every), area)
 
 
 def _sampled_hits(
@@ -147,18 +208,32 @@ def _sensor_poses(survey: Survey, mounted: Mounted, firings: Ints) -> tuple[Floa
     return origins, matmul(rotations, mounted.mount.rotation_matrix)
 
 
-def _count_cells(points: Floats, weights: Floats, area: Sequence[Ring]) -> DensityMap:
-    """Count weighted points of shape (n, 2) in cells that contain enough of them."""
-    corners = np.concatenate([np.asarray(ring, np.float64) for ring in area])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    inside = ((points >= low) & (points < high)).all(axis=1)
-    extent = high - low
-    per_m2 = max(inside.sum(), 1) / extent.prod()
-    cell_m = nice_cell_m((CELL_POINTS / per_m2) ** 0.5)
-    shape = np.maximum(np.ceil(extent / cell_m - 1e-9).astype(int), 1)
-    column, row = ((points[inside] - low) / cell_m).astype(np.int64).T
-    counts = np.bincount(row * shape[0] + column, weights[inside], int(shape.prod()))
-    return DensityMap(counts.reshape(shape[1], shape[0]) / cell_m**2, low, cell_m)
+def _count_in_area(points: Floats, weight: float, area: Sequence[Ring]) -> DensityMap:
+    """Count points of shape (n, 2), each of which represents `weight` points, in an area."""
+    lower, upper = _bounds(area)
+    extent = upper - lower
+    inside = ((points >= lower) & (points < upper)).all(axis=1)
+    least_m = cell_side_m(inside.sum() / extent.prod(), area)
+    side_m = nice_cell_m(least_m) / _SQUARES_PER_CELL
+    shape = np.ceil(extent / side_m - 1e-9).astype(int)
+    column, row = ((points[inside] - lower) / side_m).astype(np.int64).T
+    counts = weight * np.bincount(row * shape[0] + column, minlength=int(shape.prod()))
+    squares = Squares(counts.reshape(shape[1], shape[0]), lower, side_m)
+    return DensityMap.from_squares(squares, area, least_m)
+
+
+def cell_side_m(density_m2: float, area: Sequence[Ring]) -> float:
+    """Return the side in meters of cells that contain enough points, at most that of the area."""
+    longest_m = longest_side_m(area)
+    if density_m2 * longest_m**2 <= CELL_POINTS:
+        return longest_m
+    return float((CELL_POINTS / density_m2) ** 0.5)
+
+
+def longest_side_m(area: Sequence[Ring]) -> float:
+    """Return the longest side of the bounding box of an area in meters."""
+    lower, upper = _bounds(area)
+    return float((upper - lower).max())
 
 
 def nice_cell_m(least_m: float) -> float:

@@ -12,7 +12,7 @@ from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.table import Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
-from ..plan.flight_density import DensityMap
+from ..plan.flight_density import Squares
 from .count_loops import SHIFT, count_cells, count_labels
 
 _SQUARES = 1024  # maximum grid size along each axis, a power of two
@@ -181,14 +181,13 @@ class CloudCounts:
         cell_m = squares.side * self._precision_m
         return Density(squares.mean / cell_m**2, squares.median / cell_m**2, cell_m)
 
-    def density_map(self, least_m: float) -> DensityMap:
-        """Return the density in square cells with sides of at least `least_m` meters."""
-        squares = deepcopy(self._squares)
-        while squares.side * self._precision_m < least_m:
-            squares.coarsen()
-        cell_m = squares.side * self._precision_m
-        corner = cell_positions(squares.lowest, self._precision_m, self._origin[:2])
-        return DensityMap(squares.counts.T / cell_m**2, corner, cell_m)
+    def squares(self, least_m: float) -> Squares:
+        """Return the points in squares with sides of at least `least_m` meters."""
+        grid = deepcopy(self._squares)
+        while grid.side * self._precision_m < least_m:
+            grid.coarsen()
+        corner = cell_positions(grid.lowest, self._precision_m, self._origin[:2])
+        return Squares(grid.counts.T, corner, grid.side * self._precision_m)
 
 
 class GridCounts:

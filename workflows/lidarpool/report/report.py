@@ -23,7 +23,7 @@ from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
 from ..clouds.flight_lines import summarize_flight_lines
-from ..plan.flight_density import CELL_POINTS, summarize_density
+from ..plan.flight_density import DensityMap, cell_side_m, longest_side_m, summarize_density
 from ..plan.planning import Search
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
@@ -51,6 +51,7 @@ _SUMMARY_ENTRIES = (
     "backend", "notes", "scans", "sweeps", "rays", "hits", "points", "points_by_object", "seconds",
     "placement_violations", "replayed", "resumed_scans", "flight",
 )  # fmt: skip
+_MAX_SQUARES = 1000  # maximum number of squares along each side of a planned area
 _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
@@ -123,16 +124,18 @@ def describe_flight(scenario: Scenario | None, scene: Scene, cloud: CloudCounts)
     """Compare the density of a cloud with the flight plan of its scenario.
 
     The result has the entry `flight`, or is empty if there is no plan. The value is None if the
-    points are not in world coordinates, or if the planned area is too small.
+    points are not in world coordinates, or if there are none.
     """
     if scenario is None or scenario.flight is None:
         return {}
     plan = scenario.flight
     found = None
     if scenario.cloud.coordinates == "world" and cloud.point_count:
-        counts = cloud.density_map((CELL_POINTS / plan.density_m2) ** 0.5)
-        counts = counts._replace(corner=counts.corner - scene.world_origin[:2])
-        found = summarize_density(counts, plan.area, plan.density_m2)
+        squares = cloud.squares(longest_side_m(plan.area) / _MAX_SQUARES)
+        squares = squares._replace(corner=squares.corner - scene.world_origin[:2])
+        least_m = cell_side_m(plan.density_m2, plan.area)
+        counted = DensityMap.from_squares(squares, plan.area, least_m)
+        found = summarize_density(counted, plan.density_m2)
     return {"flight": found and found._asdict()}
 
 
