@@ -14,6 +14,7 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
+from lidarpool.clouds.recording import FiredRays
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing import comparison, range_image, two_clouds
 from lidarpool.datasets.figures import rank_correlation
@@ -764,3 +765,15 @@ def test_coordinates_of_a_damaged_file_are_refused(tmp_path):
     np.save(tmp_path / "damaged.npy", points)
     with pytest.raises(LidarError, match=r"damaged\.npy extends 1e\+226 m from the origin, .* dam"):
         compare(tmp_path / "damaged.npy", tmp_path / "whole.npy")
+
+
+def test_rays_of_a_measured_trajectory_are_the_same_despite_its_errors():
+    positions, quaternions = np.zeros((3, 3)), np.tile([0.0, 0, 0, 1], (3, 1))
+    true = FiredRays("key", positions, quaternions, is_measured=False)
+    moved = true._replace(positions=positions + 0.2)
+    assert true.are_same(true)
+    assert not true.are_same(moved)
+    assert true.are_same(moved._replace(is_measured=True))
+    assert moved._replace(is_measured=True).are_same(true)
+    assert not true.are_same(moved._replace(is_measured=True, key="other times"))
+    assert not true.are_same(true._replace(positions=positions + 50, is_measured=True))

@@ -23,6 +23,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import AnyArray, AnyFloats
 from lidarsim.scene.files.stated_system import StatedSystem
+from lidarsim.sweeps.instruments import TRAJECTORY_FILE
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 from lidarsim.words import printable
 
@@ -445,5 +446,12 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
         "represent lost returns. To compare lost returns, run the survey with `keep_every: 1`"
     )
     fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
-    load = partial(Sweeps.load, sweeps_path)
-    return open_cloud(source.name, cloud, load, source.sensor, source.intensity, **fields)
+    return open_cloud(
+        source.name,
+        cloud,
+        partial(Sweeps.load, sweeps_path),
+        source.sensor,
+        source.intensity,
+        has_measured_poses=source.path.with_name(TRAJECTORY_FILE).exists(),
+        **fields,
+    )

@@ -14,7 +14,7 @@ from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from threading import RLock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from .recorded_boxes import RecordedBoxes
 from .rings import Rings
 
 METERS: Meters = (1.0, 1.0, 1.0)
+_MAX_POSE_ERROR_M = 10.0  # maximum error of a measured trajectory for which rays can be paired
 _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
@@ -51,6 +52,29 @@ class SeveralSensorsError(LidarError):
         super().__init__(f"{contents} Choose one of them with `{option}`.")
         self.contents = contents
         self.names = names
+
+
+class FiredRays(NamedTuple):
+    """Start times and poses of sweeps, which identify their rays."""
+
+    key: str  # identifies the times, and the columns that identify the rays in a sweep
+    positions: Floats  # (n, 3), world coordinates, meters
+    quaternions: Floats  # (n, 4)
+    is_measured: bool  # whether the poses contain the errors of a measured trajectory
+
+    def are_same(self, other: FiredRays) -> bool:
+        """Return whether both sweeps have the same rays.
+
+        The poses must be equal, except for the errors of a measured trajectory.
+        """
+        if self.key != other.key or self.positions.shape != other.positions.shape:
+            return False
+        if self.is_measured or other.is_measured:
+            offsets = self.positions - other.positions
+            return bool(np.abs(offsets).max(initial=0.0) < _MAX_POSE_ERROR_M)
+        return np.array_equal(self.positions, other.positions) and np.array_equal(
+            self.quaternions, other.quaternions
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,9 +142,8 @@ class Recording:
         Intensity of a white surface, if it does not depend on the range.
     energies
         Whether intensities are energies, as in results.
-    firing_key
-        Key that identifies the rays of the recording. Recordings with the same key have the same
-        rays. An empty string if the rays are unknown.
+    fired_rays
+        Times and poses that identify the rays of the recording, or None if they are unknown.
     noise_classes
         Classes of noise points, which are omitted together with withheld points. None to keep all
         points.
@@ -152,7 +175,7 @@ class Recording:
     thinned: bool = False
     white: float | None = None
     energies: bool = False
-    firing_key: str = ""
+    fired_rays: FiredRays | None = None
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
     notes: tuple[str, ...] = ()
     # {number of an item: points omitted from it}
@@ -539,6 +562,8 @@ def open_cloud(
     load_sweeps: Callable[[], Sweeps] | None,
     sensor: str | None,
     intensity: str | None,
+    *,
+    has_measured_poses: bool = False,
     **fields: Any,
 ) -> Recording:
     """Open a lidarpool cloud as the sweeps of a sensor, or in parts if it has no sweeps.
@@ -553,6 +578,8 @@ def open_cloud(
         Function that returns the sweeps of the cloud, or None for a cloud without sweeps.
     sensor, intensity
         Sensor and intensity column that the user chose, or None.
+    has_measured_poses
+        Whether the poses contain the errors of a measured trajectory.
     fields
         Further fields of `Recording`.
 
@@ -605,11 +632,13 @@ def open_cloud(
     fields["energies"] = intensity in (None, "intensity")
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:
-        poses = saved.pose.positions[indices], saved.pose.quaternions[indices]
         # `compared_sweep` identifies rays by their time if possible, otherwise by their number.
         key = max(ray_columns), "return_number" in columns
-        fields["firing_key"] = fingerprint(
-            key, saved.scans[indices], saved.begins_ns[indices], poses
+        fields["fired_rays"] = FiredRays(
+            fingerprint(key, saved.scans[indices], saved.begins_ns[indices]),
+            saved.pose.positions[indices],
+            saved.pose.quaternions[indices],
+            is_measured=has_measured_poses,
         )
     if saved.actors:
         fields["read_boxes"] = lambda: RecordedBoxes.from_sweeps(saved, indices)

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -356,10 +357,12 @@ class _Comparing:
             else:
                 pairs.append(_NearestPairs(distance, intensity, reference.intensity[index]))
 
-    @property
+    @cached_property
     def has_same_rays(self) -> bool:
         first, second = self.recordings
-        return bool(first.firing_key) and first.firing_key == second.firing_key
+        if first.fired_rays is None or second.fired_rays is None:
+            return False
+        return first.fired_rays.are_same(second.fired_rays)
 
     def _add_ranges(self, a: Sweep, b: Sweep, budget: int) -> None:
         """Compare the ranges of two sweeps by ray if both have the same rays, otherwise by cell.
@@ -538,7 +541,7 @@ class _Comparing:
         first, second = self.recordings
         if not self.has_same_rays:
             instead = "Their ranges are not compared"
-            if first.energies and second.energies and not (first.firing_key and second.firing_key):
+            if first.energies and second.energies and None in (first.fired_rays, second.fired_rays):
                 instead += (
                     ". To compare two results ray by ray, run both with `cloud: {columns: [time]}`"
                 )
