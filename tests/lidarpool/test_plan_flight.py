@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import re
 from xml.etree import ElementTree
 
 import numpy as np
@@ -154,9 +156,12 @@ def test_turns_are_as_short_as_possible():
     ("options", "words"),
     [
         ({"density_m2": 500, "speeds_m_s": (50, 70)}, "Reduce `--speed` to 2.3 or `--agl` to 23"),
-        ({"agl_m": 6000}, r"maximum range of RIEGL VQ-780i is 5600 m. Reduce `--agl` to 4800"),
-        ({"agl_m": 60}, "minimum range of RIEGL VQ-780i is 100 m. Increase `--agl` to 100"),
-        ({"agl_m": 150, "speeds_m_s": (70, 70)}, "maximum scan frequency is 300 Hz. Reduce `--sp"),
+        ({"agl_m": 5500}, r"maximum range of RIEGL VQ-780i is 5600 m. Reduce `--agl` to 4800"),
+        ({"agl_m": 90}, "minimum range of RIEGL VQ-780i is 100 m. Increase `--agl` to 100"),
+        (
+            {"agl_m": 150, "speeds_m_s": (70, 70)},
+            "maximum scan frequency is 300 Hz. Reduce `--speed` to ",
+        ),
     ],
 )
 def test_what_a_plan_cannot_meet(scanner, options, words):
@@ -170,6 +175,54 @@ def test_the_advice_of_a_shortfall_is_sufficient(scanner):
     for options in ({"speeds_m_s": (38, 38)}, {"agl_m": 320}):
         better = planned(scanner, density_m2=30, **{"speeds_m_s": (60, 60), **options})
         assert not any("density" in note for note in better.notes), options
+
+
+def test_the_advice_on_the_minimum_range_is_sufficient():
+    # The strips of higher lines are wider, so they contain higher ground beyond the area.
+    pit = [(-3000, 300), (-100, 0), (1100, 0), (4000, 300)]
+    slopes = [
+        quad(f"Slope {k}", (x0, -3000, z0), (x1, -3000, z1), (x1, 4000, z1), (x0, 4000, z0))
+        for k, ((x0, z0), (x1, z1)) in enumerate(itertools.pairwise(pit))
+    ]
+    ground = Terrain(Scene.from_meshes(slopes))
+    als = AirborneScanner.load("airborne/leica-als50-ii")
+    settings = {"area": SQUARE, "terrain": ground, "heading_deg": 0, "overlap": 0.2}
+    low = planned(als, agl_m=199, **settings)
+    (note,) = (note for note in low.notes if "minimum range" in note)
+    assert not re.search(r"only 200 m .* is 200 m", note)
+    advised = int(re.search(r"Increase `--agl` to (\d+)$", note)[1])
+    assert not any("minimum range" in n for n in planned(als, agl_m=advised, **settings).notes)
+    with pytest.raises(LidarError, match="No point is within the range limits") as error:
+        planned(als, agl_m=90, **settings)
+    advised = int(re.search(r"Increase `--agl` to (\d+), or", str(error.value))[1])
+    assert not any("minimum range" in n for n in planned(als, agl_m=advised, **settings).notes)
+
+
+def test_no_line_is_added_for_a_negligible_strip(scanner):
+    swath = scanner.swath_m(500)
+    assert len(planned(scanner, shapely.box(0, 0, 2000, 1.009 * swath)).lines) == 1
+    close = planned(scanner, shapely.box(0, 0, 2000, 1.05 * swath))
+    assert len(close.lines) == 2
+    (note,) = close.notes
+    agl_m = int(re.search(r"covers the area with `--agl (\d+)`", note)[1])
+    assert len(planned(scanner, shapely.box(0, 0, 2000, 1.05 * swath), agl_m=agl_m).lines) == 1
+
+
+def test_the_required_extent_of_the_terrain_is_sufficient():
+    avia = AirborneScanner.load("livox/avia")  # looks forward, too
+    area = shapely.box(0, 0, 200, 100)
+
+    def notes(margin_m):
+        corners = [(-margin_m, -margin_m, 0), (200 + margin_m, -margin_m, 0),
+                   (200 + margin_m, 100 + margin_m, 0), (-margin_m, 100 + margin_m, 0)]  # fmt: skip
+        ground = Terrain(Scene.from_meshes([quad("Ground", *corners)]))
+        plan = planned(avia, area, ground, agl_m=90)
+        return [note for note in plan.notes if "terrain is missing" in note]
+
+    (note,) = notes(10)
+    required_m = int(re.search(r"beyond the area by (\d+) m", note)[1])
+    assert required_m > 2 + avia.ahead * 90
+    assert not notes(required_m)
 
 
 def test_what_cannot_be_planned(scanner):
@@ -307,7 +360,9 @@ def test_areas_from_text_and_files(tmp_path):
     ("text", "words"),
     [
         ("5,0,-5,20", "bounds must be"),
-        ("POLYGON ((0 0, 1 1", "cannot be read"),
+        ("POLYGON ((0 0, 1 1", "not a valid polygon in WKT. Expected, for example, `POLYGON"),
+        ("POLYGON (0 0, 10 0, 10 10, 0 0)", "with two pairs of parentheses"),
+        ("POLYGON ((0 0, 10 0, 10 10))", "not closed. Repeat the first point at its end"),
         ("POLYGON ((0 0, 10 10, 10 0, 0 10, 0 0))", "not a valid polygon: Self-intersection"),
         ("missing.geojson", "missing.geojson does not exist"),
     ],

@@ -24,7 +24,8 @@ def folder(tmp_path, monkeypatch):
     ("arguments", "words"),
     [
         (("--overlap", "99%"), "'99%' is not a valid overlap. Expected a value from 0% to 95%"),
-        (("--speed", "12-4"), "'12-4' is not a valid speed. Expected a speed from 0.1 to 400"),
+        (("--speed", "12-4"), "the lower limit comes first. Use `--speed 4-12`"),
+        (("--speed", "0-4"), "'0-4' is not a valid speed. Expected a speed from 0.1 to 400"),
         pytest.param(
             ("--unit", "mm"),
             "`--unit` and `--up-axis` require a terrain.",
@@ -40,10 +41,17 @@ def test_options_that_are_refused(folder, lidarpool, arguments, words):
 
 
 @pytest.mark.extended
+def test_bounds_may_start_with_a_minus_sign(folder, lidarpool):
+    outcome = lidarpool("flight", "-75,-50,75,50", *FLIGHT, "--json")
+    assert outcome.code == 0, outcome.err
+    assert json.loads(outcome.out)["lines"][0]["start"][0] == pytest.approx(-77)
+
+
+@pytest.mark.extended
 def test_a_plan_over_level_ground(folder, lidarpool):
     outcome = lidarpool("flight", "0,0,200,100", *FLIGHT, "--cross", "1", "--epsg", "25832")
     assert outcome.code == 0, outcome.err
-    assert outcome.out.startswith("2 flight lines, ")
+    assert outcome.out.startswith("1 flight line and 1 cross strip, ")
     assert outcome.out.endswith(
         "plan in area-flight: flight.yaml, path.csv, flight.png, flight.geojson, flight.kml\n"
         "next: lidarpool check area-flight/flight.yaml\n"

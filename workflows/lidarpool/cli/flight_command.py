@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.words import format_rounded, plural
+from lidarsim.words import format_rounded
 
 from . import completion
 from . import shared_options as options
@@ -39,6 +40,7 @@ _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degre
 # Level ground extends beyond the trajectory by this multiple of half the swath.
 _GROUND_MARGIN = 1.5
 _MIN_MARGIN_M = 50
+_NEGATIVE_BOUNDS = re.compile(r"-[\d.]+,")
 _ORIGIN_M = 100.0  # the origin of a plan in a UTM zone is a multiple of this length
 
 
@@ -62,6 +64,11 @@ def _parse_speeds(text: str) -> tuple[float, float]:
         speeds = float(low), float(high or low)
     except ValueError:
         speeds = math.nan, math.nan
+    if speeds[0] > speeds[1]:
+        raise click.BadParameter(
+            f"{text!r} is not a valid range of speeds, because the lower limit comes first. Use "
+            f"`--speed {high}-{low}`."
+        )
     if not 0.1 <= speeds[0] <= speeds[1] <= 400:
         raise click.BadParameter(
             f"{text!r} is not a valid speed. Expected a speed from 0.1 to 400 m/s such as 8, or "
@@ -70,7 +77,17 @@ def _parse_speeds(text: str) -> tuple[float, float]:
     return speeds
 
 
-@click.command(context_settings={"show_default": True})
+class _FlightCommand(click.Command):
+    """A command whose arguments can be bounds that start with a minus sign."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Prefix such bounds with a space, so that they are not parsed as an option."""
+        return super().parse_args(
+            ctx, [f" {text}" if _NEGATIVE_BOUNDS.match(text) else text for text in args]
+        )
+
+
+@click.command(cls=_FlightCommand, context_settings={"show_default": True})
 @click.argument("area", metavar="AREA")
 @click.option(
     "--sensor",
@@ -306,9 +323,7 @@ def _area_name(area: str) -> str:
     return path.stem if path.suffix in (".geojson", ".json", ".wkt", ".txt") else "area"
 
 
-def _write_plan(
-    plan: FlightPlan, site: _Site, folder: Path, terminal: Terminal
-) -> AreaDensity:
+def _write_plan(plan: FlightPlan, site: _Site, folder: Path, terminal: Terminal) -> AreaDensity:
     """Write all files of a plan, and return the expected density in the area."""
     from ..clouds.folder import staging
     from ..plan.flight_density import expected_density, summarize_density
@@ -432,9 +447,12 @@ def _head(plan: FlightPlan, density: AreaDensity) -> str:
 def _summary(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
     """Yield sentences about the lines, the rates and the density."""
     scanner = plan.scanner
-    spacing = "" if plan.spacing_m is None else f", {plan.spacing_m:.1f} m apart"
+    spacing = ""
+    if plan.spacing_m is not None:
+        subject = ", the lines" if plan.count("cross") else ","
+        spacing = f"{subject} {plan.spacing_m:.1f} m apart"
     yield (
-        f"{plural(len(plan.lines), 'flight line')}{spacing}, {plan.length_m / 1000:,.2f} km in "
+        f"{plan.counts}{spacing}, {plan.length_m / 1000:,.2f} km in "
         f"total, {plan.duration_s / 60:.1f} min in the air at {plan.rates.speed_m_s:g} m/s."
     )
     yield (
@@ -450,10 +468,15 @@ def _summary(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
 def _density_notes(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
     """Yield a note if a part of the area has fewer points than planned."""
     if density.empty > 0:
+        remedy = (
+            "because it is hidden, or outside the swath over high ground. Increase `--overlap` or "
+            "`--agl`, or follow the terrain with `--follow`"
+        )
+        if not plan.is_in_range:
+            remedy = "because it is out of range or hidden. Change the height first, as noted above"
         yield (
             f"{max(density.empty, 0.001):.1%} of the area has no points in cells of "
-            f"{density.cell_m:g} m, because it is out of range, hidden, or outside the swath over "
-            "high ground. Increase `--overlap` or `--agl`, or follow the terrain with `--follow`"
+            f"{density.cell_m:g} m, {remedy}"
         )
     is_short = plan.density_m2 is None or plan.densities_m2[0] < 0.98 * plan.density_m2
     if density.reached < 0.95 and not is_short:

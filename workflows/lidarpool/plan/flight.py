@@ -18,12 +18,13 @@ from lidarsim.schema.checks import check_number
 from lidarsim.survey.survey import MAX_SENSORS
 from lidarsim.words import plural
 
-from .flight_lines import FlightLine, Layout, Terrain, longest_side, place_lines
+from .flight_lines import FlightLine, Kind, Layout, Terrain, longest_side, place_lines
 from .flight_path import FlightPath, fly
 from .flight_scanner import AirborneScanner
 
 SPEEDS_M_S = (3.0, 70.0)  # default limits of the speed over ground
 _QUANTILES = (0.05, 0.95)  # of the height above ground, for the spacing and for the speed
+_CLOSE = 0.1  # lines that are closer than this share of the swath are noted
 _EVEN = 2.0  # largest ratio of the distances along and across the track that is not noted
 
 
@@ -61,12 +62,36 @@ class FlightPlan:
     density_m2: float | None  # requested density
     densities_m2: tuple[float, float]  # densities of a strip over the lowest and highest ground
     missing: float  # share of the samples without ground
+    reach_m: float  # distance by which the strips extend beyond the area
+    # Height above ground at which no ground is closer than the minimum range, or None if this is so
+    required_agl_m: int | None = None
     notes: tuple[str, ...] = ()  # requirements that are not met, and how to meet them
 
     @property
     def swath_m(self) -> float:
         """Width of the swath at the requested height above ground, in meters."""
         return self.scanner.swath_m(self.layout.agl_m)
+
+    def count(self, kind: Kind) -> int:
+        """Return the number of flight lines or cross strips."""
+        return sum(line.kind == kind for line in self.lines)
+
+    @property
+    def counts(self) -> str:
+        """Numbers of flight lines and cross strips in words."""
+        lines = plural(self.count("line"), "flight line")
+        cross = self.count("cross")
+        return f"{lines} and {plural(cross, 'cross strip')}" if cross else lines
+
+    @property
+    def farthest_m(self) -> float:
+        """Maximum distance of the ground from the scanner, at the edges of the swath."""
+        return self.highest_m / math.cos(math.radians(self.scanner.half_fov_deg))
+
+    @property
+    def is_in_range(self) -> bool:
+        """Whether all the ground below the strips is within the range limits of the sensor."""
+        return self.required_agl_m is None and self.farthest_m <= self.scanner.sensor.max_range_m
 
     def line_density_m2(self, line: FlightLine) -> tuple[float, float]:
         """Return the densities of a strip over the lowest and the highest ground below it."""
@@ -116,9 +141,9 @@ def plan_flight(
 ) -> FlightPlan:
     """Plan the flight lines that cover an area.
 
-    The lines are parallel to the longest side of the area. Their spacing results in the overlap at
-    the 5 % quantile of the heights above ground, and their speed in the density at the 95 %
-    quantile.
+    The lines are parallel to the longest side of the area. Adjacent strips have at least the
+    overlap, within 1 % of the swath, at the 5 % quantile of the heights above ground, and strips
+    have the density at the 95 % quantile.
 
     Parameters
     ----------
@@ -150,7 +175,8 @@ def plan_flight(
     ------
     LidarError
         If a value is out of range, if there is no ground below a line, if the ground is higher than
-        the aircraft, or if there are too many lines.
+        the aircraft, if no ground is within the range limits of the sensor, or if there are too
+        many lines.
 
     Examples
     --------
@@ -167,15 +193,13 @@ def plan_flight(
         check_number("density_m2", density_m2, gt=0, le=1e5)
     heading = longest_side(area) if heading_deg is None else math.radians(90 - heading_deg)
     layout = Layout(agl_m, heading, overlap, cross, follow)
-    strips = place_lines(area, terrain, scanner, layout, agl_m)
-    lowest_m = float(np.quantile(strips.clearances_m, _QUANTILES[0]))
-    if lowest_m < agl_m:  # the swath is narrower over high ground
-        strips = place_lines(area, terrain, scanner, layout, max(lowest_m, 0.05 * agl_m))
-    if not strips.clearances_m.min() > 0:
-        raise LidarError(
-            f"The ground rises {-strips.clearances_m.min():.0f} m above a flight line. Increase "
-            "`--agl`, or follow the terrain with `--follow`."
-        )
+    strips = place_lines(area, terrain, scanner, layout, _QUANTILES[0])
+    lowest_m = float(strips.clearances_m.min())
+    highest_m = float(strips.clearances_m.max())
+    required_agl_m = None
+    if lowest_m < max(scanner.sensor.min_range_m, 1e-3):
+        required_agl_m = _required_agl_m(area, terrain, scanner, layout, lowest_m)
+    _check_heights(scanner, lowest_m, highest_m, required_agl_m)
     quantiles_m = np.quantile(strips.clearances_m, _QUANTILES).tolist()
     narrow_m, wide_m = map(scanner.swath_m, quantiles_m)
     rates = _choose_rates(scanner, wide_m, scanner.swath_m(agl_m), density_m2, speeds_m_s)
@@ -187,13 +211,58 @@ def plan_flight(
         rates=rates,
         layout=layout,
         spacing_m=strips.spacing_m,
-        lowest_m=float(strips.clearances_m.min()),
-        highest_m=float(strips.clearances_m.max()),
+        lowest_m=lowest_m,
+        highest_m=highest_m,
         density_m2=density_m2,
         densities_m2=(rates.density_m2(wide_m), rates.density_m2(narrow_m)),
         missing=strips.missing,
+        reach_m=strips.reach_m,
+        required_agl_m=required_agl_m,
     )
     return replace(plan, notes=tuple(_shortfalls(plan)))
+
+
+def _required_agl_m(
+    area: Any, terrain: Terrain, scanner: AirborneScanner, layout: Layout, lowest_m: float
+) -> int:
+    """Return a height above ground in meters at which no ground is closer than the minimum range.
+
+    `lowest_m` is the minimum distance from the ground at the current height. The strips of higher
+    lines are wider, so they may contain higher ground.
+    """
+    least_m = max(scanner.sensor.min_range_m, 1.0)
+    agl_m = layout.agl_m
+    while lowest_m < least_m:
+        agl_m = float(math.ceil(agl_m + least_m - lowest_m))
+        strips = place_lines(area, terrain, scanner, replace(layout, agl_m=agl_m), _QUANTILES[0])
+        lowest_m = float(strips.clearances_m.min())
+    return round(agl_m)
+
+
+def _check_heights(
+    scanner: AirborneScanner, lowest_m: float, highest_m: float, required_agl_m: int | None
+) -> None:
+    """Raise LidarError if the ground is above the aircraft, or if no point is in range."""
+    if not lowest_m > 0:
+        raise LidarError(
+            f"The ground rises {-lowest_m:.0f} m above a flight line. Increase `--agl` to "
+            f"{required_agl_m}, or follow the terrain with `--follow`."
+        )
+    sensor = scanner.sensor
+    farthest_m = highest_m / math.cos(math.radians(scanner.half_fov_deg))
+    if farthest_m < sensor.min_range_m:
+        raise LidarError(
+            f"No point is within the range limits of {sensor.model}. Its minimum range is "
+            f"{sensor.min_range_m:g} m, but the ground is at most {farthest_m:.0f} m from the "
+            f"scanner at the height of the flight lines. Increase `--agl` to {required_agl_m}, or "
+            "use another sensor."
+        )
+    if lowest_m > sensor.max_range_m:
+        raise LidarError(
+            f"No point is within the range limits of {sensor.model}. Its maximum range is "
+            f"{sensor.max_range_m:g} m, but the flight lines are at least {lowest_m:.0f} m above "
+            "the ground. Reduce `--agl`, or use another sensor."
+        )
 
 
 def _choose_rates(
@@ -250,6 +319,13 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
     """Yield notes about requirements that the plan does not meet, and how to meet them."""
     yield from _density_shortfall(plan)
     yield from _range_shortfalls(plan)
+    spacing_m = plan.spacing_m
+    if plan.count("line") == 2 and spacing_m is not None and spacing_m < _CLOSE * plan.swath_m:
+        higher_m = spacing_m / (2 * plan.scanner.tangent)
+        yield (
+            f"The two lines are only {spacing_m:.1f} m apart. A single line covers the area with "
+            f"`--agl {math.ceil(plan.layout.agl_m + higher_m)}`"
+        )
     overlap = plan.min_overlap
     if overlap is not None and overlap < plan.layout.overlap - 0.02:
         remedy = "" if plan.layout.follow else ", or follow the terrain with `--follow`"
@@ -260,7 +336,8 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
     ratio = plan.along_m / plan.across_m
     slowest, fastest = plan.scanner.rates_hz
     if not 1 / _EVEN <= ratio <= _EVEN and slowest < fastest:
-        limit, remedy = "maximum", "Reduce `--speed`"
+        # The distance along the track is proportional to the speed.
+        limit, remedy = "maximum", f"Reduce `--speed` to {_floor(plan.rates.speed_m_s / ratio)}"
         if ratio < 1:
             limit, remedy = "minimum", "Increase `--speed`, or reduce `--agl`"
         yield (
@@ -271,7 +348,7 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
         yield (
             f"The terrain is missing below {plan.missing:.0%} of the "
             f"{plural(len(plan.lines), 'strip')}. Use a terrain that extends beyond the area by "
-            "half a swath"
+            f"{math.ceil(plan.reach_m)} m"
         )
 
 
@@ -295,18 +372,18 @@ def _range_shortfalls(plan: FlightPlan) -> Iterator[str]:
     """Yield notes if the ground is out of range."""
     sensor = plan.scanner.sensor
     agl_m = plan.layout.agl_m
-    slant_m = plan.highest_m / math.cos(math.radians(plan.scanner.half_fov_deg))
+    slant_m = plan.farthest_m
     if slant_m > sensor.max_range_m:
         yield (
             f"The range at the edges of the swath is up to {slant_m:,.0f} m, but the maximum range "
             f"of {sensor.model} is {sensor.max_range_m:g} m. Reduce `--agl` to "
             f"{_floor(agl_m * sensor.max_range_m / slant_m)} or less, or reduce `--fov`"
         )
-    if plan.lowest_m < sensor.min_range_m:
+    if plan.required_agl_m is not None:
         yield (
-            f"The aircraft is only {plan.lowest_m:,.0f} m above the highest ground, but the "
-            f"minimum range of {sensor.model} is {sensor.min_range_m:g} m. Increase `--agl` to "
-            f"{math.ceil(agl_m + sensor.min_range_m - plan.lowest_m)}"
+            f"The aircraft is only {math.floor(10 * plan.lowest_m) / 10:,g} m above the highest "
+            f"ground, but the minimum range of {sensor.model} is {sensor.min_range_m:g} m. "
+            f"Increase `--agl` to {plan.required_agl_m}"
         )
 
 

@@ -65,9 +65,9 @@ def read_area(text: str) -> Area | None:
                 raise ValueError("bounds must be XMIN,YMIN,XMAX,YMAX in ascending order")
             shape = shapely.box(x0, y0, x1, y1)
         elif is_wkt:
-            shape = shapely.from_wkt(text)
+            shape = _shape_from_wkt(text)
         elif suffix in _WKT:
-            shape = shapely.from_wkt(read_input_text(Path(text)).strip())
+            shape = _shape_from_wkt(read_input_text(Path(text)).strip())
         else:
             content = json.loads(read_input_text(Path(text)))
             epsg = _geojson_epsg(content)
@@ -75,6 +75,20 @@ def read_area(text: str) -> Area | None:
             shape = shapely.union_all([g for g in geometries if "Polygon" in g.geom_type])
     _check_shape(shape, text)
     return Area(shape, epsg)
+
+
+def _shape_from_wkt(text: str) -> Any:
+    """Return the shape of a WKT string. Raise ValueError if it is invalid."""
+    shapely = _shapely()
+    try:
+        return shapely.from_wkt(text)
+    except shapely.errors.GEOSException as error:
+        if "closed linestring" in str(error):
+            raise ValueError("the ring is not closed. Repeat the first point at its end") from None
+        raise ValueError(
+            "it is not a valid polygon in WKT. Expected, for example, `POLYGON ((0 0, 400 0, "
+            "400 200, 0 0))`, with two pairs of parentheses"
+        ) from None
 
 
 def _check_shape(shape: Any, text: str) -> None:

@@ -32,6 +32,14 @@ class Squares(NamedTuple):
     corner: Floats  # (2,), southwest corner in world coordinates, meters
     side_m: float
 
+    @property
+    def centers(self) -> tuple[Floats, Floats]:
+        """Coordinates x of the columns and y of the rows."""
+        rows, columns = self.counts.shape
+        x = self.corner[0] + (np.arange(columns) + 0.5) * self.side_m
+        y = self.corner[1] + (np.arange(rows) + 0.5) * self.side_m
+        return x, y
+
     def over(self, area: Sequence[Ring]) -> Squares:
         """Return the squares of the same grid that cover the bounding box of an area."""
         lower, upper = _bounds(area)
@@ -69,24 +77,18 @@ class DensityMap(NamedTuple):
         squares = squares.over(area)
         lower, upper = _bounds(area)
         cell_m = nice_cell_m(max(least_m, squares.side_m))
-        shape = np.maximum(np.ceil((upper - lower) / cell_m - 1e-9).astype(int), 1)
-        x, y = (
-            squares.corner[axis] + (np.arange(count) + 0.5) * squares.side_m
-            for axis, count in enumerate(squares.counts.shape[::-1])
-        )
+        columns, rows = np.maximum(np.ceil((upper - lower) / cell_m - 1e-9).astype(int), 1)
+        x, y = squares.centers
         inside = is_inside_grid(x, y, area)
-        column, row = (
-            np.clip(np.floor((values - lower[axis]) / cell_m).astype(int), 0, shape[axis] - 1)
-            for axis, values in enumerate((x, y))
-        )
-        cell = (row[:, None] * shape[0] + column)[inside]
-        total = int(shape.prod())
-        covered_m2 = np.bincount(cell, minlength=total) * squares.side_m**2
-        points = np.bincount(cell, squares.counts[inside], total)
-        density = np.full(total, np.nan)
-        np.divide(points, covered_m2, out=density, where=covered_m2 > 0)
+        column = np.clip(((x - lower[0]) / cell_m).astype(int), 0, columns - 1)
+        row = np.clip(((y - lower[1]) / cell_m).astype(int), 0, rows - 1)
+        cell = (row[:, None] * columns + column)[inside]
+        covered_m2 = np.bincount(cell, minlength=rows * columns) * squares.side_m**2
+        density = np.bincount(cell, squares.counts[inside], rows * columns)
+        density[covered_m2 == 0] = np.nan
+        np.divide(density, covered_m2, out=density, where=covered_m2 > 0)
         covered = np.minimum(covered_m2 / cell_m**2, 1.0)
-        return cls(density.reshape(shape[::-1]), covered.reshape(shape[::-1]), lower, cell_m)
+        return cls(density.reshape(rows, columns), covered.reshape(rows, columns), lower, cell_m)
 
 
 class AreaDensity(NamedTuple):

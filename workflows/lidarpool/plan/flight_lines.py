@@ -23,6 +23,7 @@ _Track = tuple[Floats, Floats]  # start and stop, with shape (2,)
 
 _ACROSS = 9  # number of ground samples across the swath
 _ALONG = 400  # maximum number of ground samples along a line
+_NEGLIGIBLE = 0.01  # share of the swath by which the coverage and the overlap may be too small
 _MARGIN_M = 2.0  # distance by which a line extends beyond the area
 
 
@@ -92,10 +93,11 @@ class Strips(NamedTuple):
     clearances_m: Floats  # heights above ground below all strips, without NaN
     spacing_m: float | None  # distance between adjacent lines, or None for a single line
     missing: float  # share of the samples without ground
+    reach_m: float  # maximum distance of a sample from the area
 
 
 def place_lines(
-    area: Any, terrain: Terrain, scanner: AirborneScanner, layout: Layout, narrow_m: float
+    area: Any, terrain: Terrain, scanner: AirborneScanner, layout: Layout, share: float
 ) -> Strips:
     """Place flight lines so that their strips cover an area.
 
@@ -105,36 +107,56 @@ def place_lines(
         Polygon or multipolygon of shapely.
     terrain, scanner, layout
         Ground, scanner and requirements.
-    narrow_m
-        Height above ground in meters at which the swath results in the requested overlap.
+    share
+        Share of the ground that may be so high that the overlap is smaller than requested.
 
     Raises
     ------
     LidarError
         If there is no ground below a line, or if there are too many lines.
     """
+    agl_m = layout.agl_m
+    strips = _place_lines(area, terrain, scanner, layout, agl_m)
+    narrow_m = float(np.quantile(strips.clearances_m, share))
+    if narrow_m < agl_m:  # the swath is narrower over high ground
+        strips = _place_lines(area, terrain, scanner, layout, max(narrow_m, 0.05 * agl_m))
+    return strips
+
+
+def _place_lines(
+    area: Any, terrain: Terrain, scanner: AirborneScanner, layout: Layout, narrow_m: float
+) -> Strips:
+    """Place flight lines.
+
+    `narrow_m` is the height above ground at which the swath results in the requested overlap.
+    """
     swath_m = scanner.swath_m(narrow_m)
     margin_m = _MARGIN_M + scanner.ahead * layout.agl_m
     offsets = _offsets(area, layout.heading, swath_m, layout.overlap)
     crossing = layout.heading + math.pi / 2
-    crossing_offsets = _even_offsets(area, crossing, layout.cross)
     tracks: dict[Kind, list[_Track]] = {
         "line": _tracks(area, layout.heading, offsets, swath_m, margin_m),
-        "cross": _tracks(area, crossing, crossing_offsets, swath_m, margin_m),
+        "cross": _tracks(
+            area, crossing, _even_offsets(area, crossing, layout.cross), swath_m, margin_m
+        ),
     }
     _check_count(sum(map(len, tracks.values())))
     lines = []
     clearances = []
+    corners = []
     for kind, ends in tracks.items():
         for number, (start, stop) in enumerate(ends, 1):
-            heights = _ground_below(terrain, start, stop, scanner.swath_m(layout.agl_m))
+            points = _points_below(start, stop, scanner.swath_m(layout.agl_m))
+            heights = terrain.heights(points.reshape(-1, 2)).reshape(points.shape[:2])
+            corners.append(points[[0, 0, -1, -1], [0, -1, 0, -1]])
             line = _line(f"{kind}-{number}", kind, start, stop, heights, scanner, layout)
             lines.append(line)
             clearances.append((line.leg.heights[:, None] - heights).ravel())
     above_m = np.concatenate(clearances)
     is_missing = np.isnan(above_m)
     spacing_m = float(offsets[1] - offsets[0]) if len(offsets) > 1 else None
-    return Strips(lines, above_m[~is_missing], spacing_m, float(is_missing.mean()))
+    reach_m = float(_distances_m(area, np.concatenate(corners)).max())
+    return Strips(lines, above_m[~is_missing], spacing_m, float(is_missing.mean()), reach_m)
 
 
 def _line(
@@ -198,9 +220,9 @@ def _offsets(area: Any, heading: float, swath_m: float, overlap: float) -> Float
     """Return the offsets of lines across their direction, so that their strips cover the area."""
     low, high = _limits(area, heading)
     excess_m = high - low - swath_m
-    if excess_m <= 0:
+    if excess_m <= _NEGLIGIBLE * swath_m:
         return np.array([(low + high) / 2])
-    count = math.ceil(excess_m / ((1 - overlap) * swath_m) - 1e-9) + 1
+    count = math.ceil(excess_m / ((1 - overlap + _NEGLIGIBLE) * swath_m)) + 1
     _check_count(count)
     return np.linspace(low + swath_m / 2, high - swath_m / 2, count)
 
@@ -242,16 +264,21 @@ def _tracks(
     return tracks
 
 
-def _ground_below(terrain: Terrain, start: Floats, stop: Floats, swath_m: float) -> Floats:
-    """Return the ground heights below a line and its swath, with shape (along, across)."""
+def _points_below(start: Floats, stop: Floats, swath_m: float) -> Floats:
+    """Return horizontal positions below a line and its swath, with shape (along, across, 2)."""
     length_m = float(np.hypot(*(stop - start)))
     ahead = (stop - start) / length_m
     count = int(np.clip(length_m / max(swath_m / 40, 0.5), 2, _ALONG))
     along = np.linspace(0, length_m, count)
     across = np.linspace(-swath_m / 2, swath_m / 2, _ACROSS)
     left = np.array([-ahead[1], ahead[0]])
-    points = start + along[:, None, None] * ahead + across[None, :, None] * left
-    return terrain.heights(points.reshape(-1, 2)).reshape(count, _ACROSS)
+    return np.asarray(start + along[:, None, None] * ahead + across[None, :, None] * left)
+
+
+def _distances_m(area: Any, points: Floats) -> Floats:
+    """Return the distances of points of shape (n, 2) from the bounding box of an area."""
+    lower, upper = np.reshape(area.bounds, (2, 2))
+    return np.asarray(np.hypot(*np.maximum(np.maximum(lower - points, points - upper), 0).T))
 
 
 def _altitudes(heights: Floats, length_m: float, layout: Layout) -> Floats:

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from lidarsim.numerics.arrays import Floats
-from lidarsim.words import format_rounded, plural
+from lidarsim.words import format_rounded
 from lidarview.render import theme
 from lidarview.render.picture_page import FONT, Page
 
@@ -115,7 +115,7 @@ def _legend(plan: FlightPlan, unit: float) -> list[Line2D]:
 
 
 def _title(plan: FlightPlan) -> str:
-    return f"{plural(len(plan.lines), 'flight line')}, {plan.duration_s / 60:.1f} min in the air"
+    return f"{plan.counts}, {plan.duration_s / 60:.1f} min in the air"
 
 
 def _details(plan: FlightPlan) -> tuple[str, str]:
