@@ -6,62 +6,88 @@ The folder contains the results `clean` and `noisy` of the commands on this page
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from docs.pictures.options import IMAGES
 from matplotlib.colors import Normalize
 
-from lidarpool import Cloud, read_cloud
+from lidarpool import read_cloud
+from lidarpool.comparing.surveys.strips import StripSettings, strip_deviations
+from lidarpool.comparing.surveys.survey_clouds import SurveyCloud
 from lidarsim.numerics.arrays import Floats
 from lidarview.render import theme
 from lidarview.render.picture_page import Page
 
-SIZE = (1600, 760)
+SIZE = (1600, 560)
 CELL_M = 4.0
-LIMIT_MM = 150.0
+LIMIT_MM = 300.0
 LOW, HIGH = np.array([-210.0, -160.0]), np.array([210.0, 160.0])
 _COLORMAP = "RdBu_r"
 
 
-def strip_errors(clean: Cloud, noisy: Cloud, sensor: int) -> Floats:
-    """Return the mean height error of a strip in cells in mm, or NaN without points."""
-    rows = clean["sensor"] == sensor
-    points = clean.positions[rows]
-    errors = noisy.positions[rows, 2] - points[:, 2]
-    shape = np.ceil((HIGH - LOW) / CELL_M).astype(int)
-    column, row = np.floor((points[:, :2] - LOW) / CELL_M).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < shape[0]) & (row < shape[1])
-    cell = (row * shape[0] + column)[inside]
-    count = np.bincount(cell, minlength=shape.prod())
-    total = np.bincount(cell, errors[inside], minlength=shape.prod())
-    return 1000 * np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape[::-1])
+class Heights(NamedTuple):
+    """Height errors or differences at horizontal positions."""
+
+    title: str
+    positions: Floats  # (n, 2), meters
+    values_mm: Floats  # (n,)
+
+    def cell_means(self) -> Floats:
+        """Return the mean of the values in each cell in mm, or NaN without values."""
+        shape = np.ceil((HIGH - LOW) / CELL_M).astype(int)
+        column, row = np.floor((self.positions - LOW) / CELL_M).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < shape[0]) & (row < shape[1])
+        cell = (row * shape[0] + column)[inside]
+        count = np.bincount(cell, minlength=shape.prod())
+        total = np.bincount(cell, self.values_mm[inside], minlength=shape.prod())
+        return np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape[::-1])
+
+
+def read_heights(folder: Path) -> Iterator[Heights]:
+    """Yield the height errors of the points of each strip, and the differences of the strips."""
+    clean, noisy = (read_cloud(folder / name / "cloud.ply") for name in ("clean", "noisy"))
+    for number, name in enumerate(("line-1", "cross-1")):
+        points = clean.positions[clean["sensor"] == number]
+        errors_mm = 1000 * (noisy.positions[noisy["sensor"] == number, 2] - points[:, 2])
+        yield Heights(f"Errors of {name}", points[:, :2], errors_mm)
+    cloud = SurveyCloud.open(folder / "noisy", "noisy", keep_noise=False)
+    # The settings are the defaults of `lidarpool compare --survey strips`.
+    strips = strip_deviations([cloud], StripSettings(cell_m=1.0, max_roughness_m=0.1))
+    differences_mm = 1000 * strips.components["delta_h"]
+    yield Heights("line-1 minus cross-1", strips.points[:, :2], differences_mm)
 
 
 def draw(folder: Path) -> Page:
-    """Draw the height errors of two strips, which are those of the measured trajectory."""
-    clean, noisy = (read_cloud(folder / name / "cloud.ply") for name in ("clean", "noisy"))
+    """Draw the height errors of two strips, and the height differences between them."""
     page = Page(SIZE)
     norm = Normalize(-LIMIT_MM, LIMIT_MM)
-    for number, name in enumerate(("line-1", "cross-1")):
-        found = strip_errors(clean, noisy, number)
+    for number, heights in enumerate(read_heights(folder)):
         axes = page.map_chart(
-            (0.08 + 0.42 * number, 0.13, 0.345, 0.65), np.stack([LOW, HIGH]), tick_count=5
+            (0.085 + 0.28 * number, 0.14, 0.235, 0.62), np.stack([LOW, HIGH]), tick_count=5
         )
-        extent = (LOW[0], HIGH[0], LOW[1], HIGH[1])
-        axes.imshow(found, cmap=_COLORMAP, norm=norm, extent=extent, origin="lower", zorder=1)
-        axes.set(aspect="equal")
-        page.heading(axes, f"{name}: mean error {np.nanmean(found):+.0f} mm")
+        axes.imshow(
+            heights.cell_means(),
+            cmap=_COLORMAP,
+            norm=norm,
+            extent=(LOW[0], HIGH[0], LOW[1], HIGH[1]),
+            origin="lower",
+            zorder=1,
+        )
+        axes.set(aspect="equal", ylabel="y (m)" if number == 0 else "")
+        page.heading(axes, f"{heights.title}: mean {heights.values_mm.mean():+.0f} mm")
     page.color_bar(
         theme.apply_colormap(_COLORMAP, np.linspace(0, 1, 256)),
         norm,
-        "height error (mm)",
-        (0.90, 0.16, 0.014, 0.58),
+        "height (mm)",
+        (0.92, 0.17, 0.014, 0.56),
     )
     page.title(
         "Two crossing strips",
-        f"Measured minus true height of the points, mean in cells of {CELL_M:g} m",
+        "Measured minus true heights of the points, and height differences at the same positions, "
+        f"mean in cells of {CELL_M:g} m",
     )
     return page
 

@@ -45,11 +45,13 @@ _ORIGIN_M = 100.0  # the origin of a plan in a UTM zone is a multiple of this le
 
 
 def _parse_overlap(text: str) -> float:
-    """Parse a percentage such as 30% or 30."""
+    """Parse a percentage such as 30% or 30, or a fraction such as 0.3."""
     try:
-        fraction = float(text.removesuffix("%")) / 100
+        fraction = float(text.removesuffix("%"))
     except ValueError:
         fraction = math.nan
+    if text.endswith("%") or fraction >= 1:
+        fraction /= 100
     if not (0 <= fraction <= 0.95):
         raise click.BadParameter(
             f"{text!r} is not a valid overlap. Expected a value from 0% to 95%, such as 30%."

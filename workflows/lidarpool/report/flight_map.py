@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from lidarsim.numerics.arrays import Floats
@@ -24,6 +26,8 @@ _LINE_COLOR = theme.SENSOR
 _CROSS_COLOR = "#ee7733"
 _AREA_COLOR = theme.INK
 _COLORMAP = "viridis"
+_PLANNED_COLOR = "#ffffff"
+_EMPTY_COLOR = "#f3a9a2"
 _MAX_NAMES = 30  # lines are not labeled if there are more
 
 
@@ -32,11 +36,19 @@ def draw_flight(plan: FlightPlan, expected: DensityMap) -> Page:
     page = Page(SIZE)
     axes = page.map_chart(_FRAME, _limits(plan))
     densities = expected.density_m2[expected.density_m2 > 0]
-    norm = Normalize(0, float(np.quantile(densities, 0.98)) if len(densities) else 1.0)
+    highest = float(np.quantile(densities, 0.98)) if len(densities) else 1.0
+    norm = Normalize(0, max(highest, 1.05 * (plan.density_m2 or 0)))
     rows, columns = expected.density_m2.shape
     x0, y0 = expected.corner.tolist()
     extent = (x0, x0 + columns * expected.cell_m, y0, y0 + rows * expected.cell_m)
-    shown = np.ma.masked_equal(expected.density_m2, 0)
+    axes.imshow(  # cells outside the area are transparent
+        np.where(expected.density_m2 == 0, 0.0, np.nan),
+        cmap=ListedColormap([_EMPTY_COLOR]),
+        extent=extent,
+        origin="lower",
+        zorder=1,
+    )
+    shown = np.where(expected.density_m2 > 0, expected.density_m2, np.nan)
     axes.imshow(shown, cmap=_COLORMAP, norm=norm, extent=extent, origin="lower", zorder=1)
     axes.set(aspect="equal")
     axes.plot(*plan.path.positions[:, :2].T, color=theme.MUTED, lw=0.5 * page.unit, zorder=2)
@@ -46,13 +58,16 @@ def draw_flight(plan: FlightPlan, expected: DensityMap) -> Page:
             axes.plot(*outline.T, color=_AREA_COLOR, lw=1.2 * page.unit, ls="--", zorder=3)
     for line in plan.lines:
         _draw_line(axes, page, line, named=len(plan.lines) <= _MAX_NAMES)
-    page.color_bar(
+    bar = page.color_bar(
         theme.apply_colormap(_COLORMAP, np.linspace(0, 1, 256)),
         norm,
         "expected points per m²",
         (0.862, 0.10, 0.014, 0.40),
     )
-    page.key(_legend(plan, page.unit), 7.2, bbox_to_anchor=(0.85, 0.70))
+    if plan.density_m2 is not None:
+        bar.axhline(plan.density_m2, color=_PLANNED_COLOR, lw=1.4 * page.unit)
+    has_empty = bool((expected.density_m2 == 0).any())
+    page.key(_legend(plan, has_empty, page.unit), 7.2, bbox_to_anchor=(0.85, 0.70))
     page.title(_title(plan), *_details(plan))
     return page
 
@@ -102,16 +117,19 @@ def _draw_line(axes: Axes, page: Page, line: FlightLine, *, named: bool) -> None
         )
 
 
-def _legend(plan: FlightPlan, unit: float) -> list[Line2D]:
+def _legend(plan: FlightPlan, has_empty: bool, unit: float) -> list[Artist]:
     """Return the entries of the legend."""
     entries = [("Flight line", _LINE_COLOR, 1.4, "-")]
     if any(line.kind == "cross" for line in plan.lines):
         entries.append(("Cross strip", _CROSS_COLOR, 1.4, "-"))
     entries += [("Turn", theme.MUTED, 0.5, "-"), ("Area", _AREA_COLOR, 1.2, "--")]
-    return [
+    handles: list[Artist] = [
         Line2D([], [], color=color, lw=width * unit, ls=style, label=name)
         for name, color, width, style in entries
     ]
+    if has_empty:
+        handles.append(Patch(color=_EMPTY_COLOR, label="No points"))
+    return handles
 
 
 def _title(plan: FlightPlan) -> str:

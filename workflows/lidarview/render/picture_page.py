@@ -407,8 +407,8 @@ class Page:
         norm: Normalize,
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
-    ) -> None:
-        """Draw a color bar with a title in the right margin."""
+    ) -> Axes:
+        """Draw a color bar with a title in the right margin, and return its axes."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
@@ -435,6 +435,7 @@ class Page:
             label_logarithms(axes.yaxis, is_narrow)
         else:
             _label_in_full(axes.yaxis)
+        return axes
 
     def save(self, path: Path) -> None:
         """Write the page as a PNG file in light colors, replacing an existing file or link.
