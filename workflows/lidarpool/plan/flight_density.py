@@ -84,7 +84,7 @@ class DensityMap(NamedTuple):
         row = np.clip(((y - lower[1]) / cell_m).astype(int), 0, rows - 1)
         cell = (row[:, None] * columns + column)[inside]
         covered_m2 = np.bincount(cell, minlength=rows * columns) * squares.side_m**2
-        density: Floats = np.bincount(cell, squares.counts[inside].astype(float), rows * columns)
+        density = np.asarray(np.bincount(cell, squares.counts[inside], rows * columns), np.float64)
         density[covered_m2 == 0] = np.nan
         np.divide(density, covered_m2, out=density, where=covered_m2 > 0)
         covered = np.minimum(covered_m2 / cell_m**2, 1.0)
@@ -219,7 +219,8 @@ def _count_in_area(points: Floats, weight: float, area: Sequence[Ring]) -> Densi
     side_m = nice_cell_m(least_m) / _SQUARES_PER_CELL
     shape = np.ceil(extent / side_m - 1e-9).astype(int)
     column, row = ((points[inside] - lower) / side_m).astype(np.int64).T
-    counts: Floats = weight * np.bincount(row * shape[0] + column, minlength=int(shape.prod()))
+    sampled = np.bincount(row * shape[0] + column, minlength=int(shape.prod()))
+    counts = np.asarray(weight * sampled, np.float64)
     squares = Squares(counts.reshape(shape[1], shape[0]), lower, side_m)
     return DensityMap.from_squares(squares, area, least_m)
 
