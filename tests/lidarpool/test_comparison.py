@@ -14,7 +14,7 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
-from lidarpool.clouds.recording import FiredRays
+from lidarpool.clouds.recording import RayTimes
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing import comparison, range_image, two_clouds
 from lidarpool.datasets.figures import rank_correlation
@@ -769,7 +769,7 @@ def test_coordinates_of_a_damaged_file_are_refused(tmp_path):
 
 def test_rays_of_a_measured_trajectory_are_the_same_despite_its_errors():
     positions, quaternions = np.zeros((3, 3)), np.tile([0.0, 0, 0, 1], (3, 1))
-    true = FiredRays("key", positions, quaternions, is_measured=False)
+    true = RayTimes("key", positions, quaternions, is_measured=False)
     moved = true._replace(positions=positions + 0.2)
     assert true.are_same(true)
     assert not true.are_same(moved)

@@ -54,7 +54,7 @@ class SeveralSensorsError(LidarError):
         self.names = names
 
 
-class FiredRays(NamedTuple):
+class RayTimes(NamedTuple):
     """Start times and poses of sweeps, which identify their rays."""
 
     key: str  # identifies the times, and the columns that identify the rays in a sweep
@@ -62,7 +62,7 @@ class FiredRays(NamedTuple):
     quaternions: Floats  # (n, 4)
     is_measured: bool  # whether the poses contain the errors of a measured trajectory
 
-    def are_same(self, other: FiredRays) -> bool:
+    def are_same(self, other: RayTimes) -> bool:
         """Return whether both sweeps have the same rays.
 
         The poses must be equal, except for the errors of a measured trajectory.
@@ -142,7 +142,7 @@ class Recording:
         Intensity of a white surface, if it does not depend on the range.
     energies
         Whether intensities are energies, as in results.
-    fired_rays
+    ray_times
         Times and poses that identify the rays of the recording, or None if they are unknown.
     noise_classes
         Classes of noise points, which are omitted together with withheld points. None to keep all
@@ -175,7 +175,7 @@ class Recording:
     thinned: bool = False
     white: float | None = None
     energies: bool = False
-    fired_rays: FiredRays | None = None
+    ray_times: RayTimes | None = None
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
     notes: tuple[str, ...] = ()
     # {number of an item: points omitted from it}
@@ -634,7 +634,7 @@ def open_cloud(
     if ray_columns := columns & {"time", "ray"}:
         # `compared_sweep` identifies rays by their time if possible, otherwise by their number.
         key = max(ray_columns), "return_number" in columns
-        fields["fired_rays"] = FiredRays(
+        fields["ray_times"] = RayTimes(
             fingerprint(key, saved.scans[indices], saved.begins_ns[indices]),
             saved.pose.positions[indices],
             saved.pose.quaternions[indices],

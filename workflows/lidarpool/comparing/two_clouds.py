@@ -360,9 +360,9 @@ class _Comparing:
     @cached_property
     def has_same_rays(self) -> bool:
         first, second = self.recordings
-        if first.fired_rays is None or second.fired_rays is None:
+        if first.ray_times is None or second.ray_times is None:
             return False
-        return first.fired_rays.are_same(second.fired_rays)
+        return first.ray_times.are_same(second.ray_times)
 
     def _add_ranges(self, a: Sweep, b: Sweep, budget: int) -> None:
         """Compare the ranges of two sweeps by ray if both have the same rays, otherwise by cell.
@@ -541,7 +541,7 @@ class _Comparing:
         first, second = self.recordings
         if not self.has_same_rays:
             instead = "Their ranges are not compared"
-            if first.energies and second.energies and None in (first.fired_rays, second.fired_rays):
+            if first.energies and second.energies and None in (first.ray_times, second.ray_times):
                 instead += (
                     ". To compare two results ray by ray, run both with `cloud: {columns: [time]}`"
                 )
