@@ -233,6 +233,27 @@ def test_a_single_sweep_cannot_show_motion(room):
     assert "motion cannot be detected in a single sweep" in repr(fitted)
 
 
+@pytest.mark.parametrize(("height_m", "uncertain"), [(1, 15), (8, 0)])
+def test_rings_with_a_single_range_are_uncertain(height_m, uncertain):
+    """At a height of 1 m, the lower rings only see the floor, and their lasers are 35 mm away."""
+    hall = Scene.from_meshes(
+        [box("hall", (-20, -15, 0), (20, 15, 20)), box("cabinet", (-1, -1.5, 0), (1, 1.5, 4))]
+    )
+    sensor = load_sensor("robosense/rs-helios")
+    fitted = fit_pattern(record(hall, sensor, 1, pose=(6, 2, height_m)))
+    found_deg = np.sort(fitted.figures["elevation_deg"])
+    errors_deg = np.abs(found_deg - np.sort(np.degrees(sensor.beams.elevation)))
+    notes = [note for note in fitted.figures["notes"] if "almost the same range" in note]
+    assert len(notes) == bool(uncertain)
+    assert errors_deg[uncertain:].max() < 0.015
+    if uncertain:
+        assert "15 rings are uncertain (-54.0 to -13.0°)" in notes[0]
+        assert "(1.2 to 4.5 m)" in notes[0]
+        assert 0.9 < errors_deg[0] < 1.62
+        assert "If the laser is 35 mm from the assumed position" in notes[0]
+        assert "wrong by up to 1.6" in notes[0]
+
+
 @pytest.mark.extended
 def test_a_pattern_without_rings_is_no_sensor_model(room):
     recording = record(room, load_sensor("livox/mid360"))

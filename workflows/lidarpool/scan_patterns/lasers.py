@@ -57,12 +57,17 @@ class RingLasers:
         perpendicular to the beam. Both have shape (r,).
     spread_rad
         Typical interquartile range of the elevations within a ring, as seen from its laser.
+    is_measured
+        Whether the ranges of each ring differ enough to measure the vertical offset of its laser.
+        Otherwise, the offset is that of a neighboring ring or 0. Shape (r,), or None if offsets
+        were not estimated.
     """
 
     elevation_rad: Floats
     vertical_m: Floats
     horizontal_m: Floats
     spread_rad: float = float("inf")
+    is_measured: Bools | None = None
 
     @classmethod
     def at_origin(cls, elevation_rad: Floats, spread_rad: float = float("inf")) -> RingLasers:
@@ -94,13 +99,14 @@ class RingLasers:
         vertical = _Offsets.combine([part.vertical_offsets() for part in parts])
         horizontal = _Offsets.combine([part.horizontal_offsets() for part in parts])
         # Lasers of neighboring rings are at similar heights, but often on opposite sides.
+        is_measured = vertical.are_certain
         vertical_m, known = vertical.significant()
         if known.any():
             apart = np.abs(elevation_rad[:, None] - elevation_rad[known])
             vertical_m = vertical_m[known][apart.argmin(axis=1)]
         horizontal_m, _ = horizontal.significant()
         level, level_spread_rad = cls(
-            elevation_rad, np.zeros(count), horizontal_m
+            elevation_rad, np.zeros(count), horizontal_m, is_measured=is_measured
         )._with_elevations(parts)
         raised, spread_rad = replace(level, vertical_m=vertical_m)._with_elevations(parts)
         if not vertical_m.any() or spread_rad > _MAX_SPREAD_SHARE * level_spread_rad:
@@ -137,6 +143,7 @@ class RingLasers:
             self.vertical_m[order],
             self.horizontal_m[order],
             self.spread_rad,
+            None if self.is_measured is None else self.is_measured[order],
         )
 
     @cached_property
@@ -261,13 +268,18 @@ class _Offsets(NamedTuple):
         )
         return found
 
+    @property
+    def are_certain(self) -> Bools:
+        """Whether the offset of each ring is known and plausible, of shape (r,)."""
+        return (self.errors_m < _MAX_ERROR_M) & (np.abs(self.values_m) < _MAX_OFFSET_M)
+
     def significant(self) -> tuple[Floats, Bools]:
         """Return the offsets, and a mask of the rings for which they are known.
 
         The offsets are zeros if those of most rings are small or insignificant, and they are 0 for
         rings for which they are unknown.
         """
-        known = (self.errors_m < _MAX_ERROR_M) & (np.abs(self.values_m) < _MAX_OFFSET_M)
+        known = self.are_certain
         zeros = np.zeros(len(known))
         if known.sum() < MIN_RINGS:
             return zeros, ~known
@@ -307,7 +319,9 @@ class _RingReturns(NamedTuple):
             elevation = elevations(points)
             range_m = np.linalg.norm(points, axis=1)
             design = np.stack([np.ones(len(points)), 1 / range_m], axis=1)
-            offsets.values_m[ring], offsets.errors_m[ring] = _robust_slope(design, elevation)
+            value_m, error_m = _robust_slope(design, elevation)
+            offsets.values_m[ring] = value_m
+            offsets.errors_m[ring] = max(error_m, _noise_slope(1 / range_m, elevation))
         return offsets
 
     def horizontal_offsets(self) -> _Offsets:
@@ -334,6 +348,18 @@ class _RingReturns(NamedTuple):
             design = np.stack([pulses[used], change[used]], axis=1)
             offsets.values_m[ring], offsets.errors_m[ring] = _robust_slope(design, turned[used])
         return offsets
+
+
+def _noise_slope(x: Floats, y: Floats) -> float:
+    """Return the largest slope of y over x that noise alone can cause.
+
+    The rounding of coordinates changes the range and the elevation of a point together. If all
+    returns of a ring have almost the same range, this is all that the slope shows. The noise is
+    estimated from the differences between neighbors.
+    """
+    variance = float(np.var(np.clip(x, *np.quantile(x, (0.01, 0.99)))))
+    noise = [1.4826 * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2) for values in (x, y)]
+    return noise[0] * noise[1] / variance if variance > 0 else float("inf")
 
 
 def _robust_slope(design: Floats, values: Floats) -> tuple[float, float]:

@@ -38,6 +38,8 @@ _MIN_OFFSET_RAD = np.radians(0.005)  # typical azimuth offset below which offset
 _MIN_TIME = 0.002  # typical time within a firing below which all beams fire at once, in firings
 _MAX_EARLY = 0.1  # firings by which a sweep may start after its first firing
 _MAX_GAP_RAD = np.radians(60)  # a wider sector without returns is outside the field of view
+_TYPICAL_OFFSET_M = 0.035  # offset of a laser whose offset cannot be measured
+_MIN_ERROR_RAD = np.radians(0.05)  # error of an elevation below which there is no note
 _MIN_ORDER = 0.8  # minimum share of steps in one direction within the rings
 _START_MARGIN_RAD = np.radians(6)  # azimuth by which the first points of rings differ
 _MAX_SAME_RING = 0.5  # share of consecutive returns of the same ring in files sorted by ring
@@ -111,12 +113,13 @@ class SpinningHead:
             1.4826 * np.median(np.abs(elevation[returns.ring == row] - lasers.elevation_rad[row]))
             for row in range(len(lasers))
         ]
+        notes = [*_uncertain_notes(returns, lasers, spread), *_one_range_notes(returns, lasers)]
         return cls(
             lasers=lasers,
             max_range_m=returns.max_range_m,
             elevation_spread_rad=np.array(spread),
             empty_rad=_empty_sector(azimuth),
-            **firings | {"notes": (*firings["notes"], *_uncertain_notes(returns, lasers, spread))},
+            **firings | {"notes": (*firings["notes"], *notes)},
         )
 
     def model(self, name: str) -> SensorModel:
@@ -178,6 +181,40 @@ def _uncertain_notes(
         f"the angles of {plural(len(uncertain), 'ring')} are uncertain, because they have few "
         f"returns or returns from the cover ({listed}{more})"
     ]
+
+
+def _one_range_notes(returns: PatternReturns, lasers: RingLasers) -> list[str]:
+    """Return a note about rings whose elevation depends on an unknown offset, if there are any.
+
+    The elevation of a laser and its offset cannot be distinguished at a single range.
+    """
+    if lasers.is_measured is None:
+        return []
+    offset_m = max(_TYPICAL_OFFSET_M, float(np.abs(lasers.vertical_m).max()))
+    range_m = np.linalg.norm(returns.points, axis=1)
+    medians_m = _medians_of_rings(range_m, returns.ring, len(lasers))
+    counts = np.bincount(returns.ring, minlength=len(lasers))
+    is_unknown = ~lasers.is_measured & (counts >= _MIN_RETURNS)
+    is_unknown &= medians_m * _MIN_ERROR_RAD < offset_m
+    if not is_unknown.any():
+        return []
+    elevation_deg = np.degrees(lasers.elevation_rad[is_unknown])
+    ranges_m = medians_m[is_unknown]
+    error_deg = float(np.degrees(offset_m / ranges_m.min()))
+    return [
+        f"the elevations of {plural(len(ranges_m), 'ring')} are uncertain "
+        f"({_interval(elevation_deg)}°), because each of them has almost the same range "
+        f"in all directions ({_interval(ranges_m)} m), from which the position of its "
+        f"laser cannot be determined. If the laser is {1e3 * offset_m:.0f} mm from the assumed "
+        f"position, the elevation is wrong by up to {error_deg:.2f}°. Record in a larger room, or "
+        "tilt the sensor so that each ring has different ranges"
+    ]
+
+
+def _interval(values: Floats) -> str:
+    """Return the smallest and the largest value as text, or one value if they are the same."""
+    first, last = (f"{value:.1f}" for value in (values.min(), values.max()))
+    return first if first == last else f"{first} to {last}"
 
 
 def _degrees(angles: Floats) -> list[float]:
