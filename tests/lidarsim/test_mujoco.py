@@ -181,12 +181,15 @@ def test_many_lidars_take_one_call(world):
     assert np.array_equal(alone.ranges(data), images[0])
     with pytest.raises(LidarError, match="There are 2 lidars"):
         scanner.sweep(data)
+    with pytest.raises(LidarError, match=r"Expected an mjData, but got .*'tuple'"):
+        alone.step((data, data))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({}, "body=NAME or site=NAME"),
+        ({"site": "lidar", "body": "robot"}, "either the body or the site .* but not both"),
         ({"site": "lidr"}, "no site 'lidr'. Did you mean 'lidar'"),
         ({"body": 99}, "no body 99"),
         ({"site": "lidar", "exclude": ["bal"]}, "no body or geom 'bal'. Did you mean 'ball'"),

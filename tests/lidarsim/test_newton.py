@@ -334,6 +334,7 @@ def test_parts_without_a_surface_are_stated(caplog):
     ("options", "message"),
     [
         ({}, "body=LABEL or site=LABEL"),
+        ({"site": "lidar", "body": "robot"}, "either the body or the site .* but not both"),
         ({"site": "lidr"}, "no site 'lidr'. Did you mean 'lidar'"),
         ({"site": "post"}, "no site 'post'"),
         ({"body": 99}, "no body 99"),
@@ -367,6 +368,22 @@ def test_wrong_models_and_states():
     state.body_q.values[2, 0] = np.nan
     with pytest.raises(LidarError, match=r"pose of body 2 \('crate'\) is not finite"):
         scanner.ranges(state)
+
+
+def test_wrong_arguments():
+    builder = two_worlds()
+    scanner = NewtonScanner(builder.model(), RING, site="lidar")
+    state = builder.state()
+    for scan in (scanner.sweep, scanner.ranges, lambda states: scanner.step(0.1, states)):
+        with pytest.raises(LidarError, match=r"single newton\.State, but got .*'tuple'"):
+            scan((state, state))
+    for time_s, kind in ((state, "SimpleNamespace"), ("0.1", "str")):
+        with pytest.raises(LidarError, match=f"time in seconds.* has the type '{kind}'"):
+            scanner.step(time_s, state)
+    for world in (9, -1, "a", 1.5, True):
+        with pytest.raises(LidarError, match=rf"No lidar belongs to the world .*{world}.*\(0, 1\)"):
+            scanner.reset(world)
+    scanner.reset(np.int32(1))
 
 
 @pytest.fixture(scope="module")

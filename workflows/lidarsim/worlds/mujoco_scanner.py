@@ -86,7 +86,10 @@ class MujocoScanner:
         **options: Any,
     ) -> None:
         if (body is None) == (site is None):
-            raise LidarError("Set the body or the site of the lidar with body=NAME or site=NAME.")
+            raise LidarError(
+                "Set either the body or the site of the lidar, with body=NAME or site=NAME, but "
+                "not both."
+            )
         self._kind = "body" if site is None else "site"
         names = body if site is None else site
         self._is_single = isinstance(names, str | int)
@@ -172,7 +175,8 @@ class MujocoScanner:
         LidarError
             If there are several lidars, or if the model contains nothing stationary.
         """
-        return self.follower.step(float(data.time), self._pose(data), self._matrices(data))
+        pose = self._pose(data)
+        return self.follower.step(float(data.time), pose, self._matrices(data))
 
     def _pose(self, data: Any) -> Floats:
         """Return the transformation matrix of the only lidar.
@@ -191,6 +195,11 @@ class MujocoScanner:
 
         The shape is (s, 4, 4).
         """
+        if not hasattr(data, "site_xpos"):
+            raise LidarError(
+                f"Expected an mjData, but got an object of type {type(data).__name__!r}. Pass for "
+                "example `mujoco.MjData(model)`."
+            )
         if self._kind == "site":
             return _matrices(data.site_xpos, data.site_xmat, self._frames)
         return _matrices(data.xpos, data.xmat, self._frames)

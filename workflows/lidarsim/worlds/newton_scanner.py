@@ -114,7 +114,10 @@ class NewtonScanner:
         **options: Any,
     ) -> None:
         if (body is None) == (site is None):
-            raise LidarError("Set the body or the site of the lidar with body=LABEL or site=LABEL.")
+            raise LidarError(
+                "Set either the body or the site of the lidar, with body=LABEL or site=LABEL, but "
+                "not both."
+            )
         _check_choice("worlds", worlds, ("own", "all"))
         _check_choice("geometry", geometry, ("visual", "collision"))
         _check_choice("objects", objects, ("body", "shape"))
@@ -184,7 +187,7 @@ class NewtonScanner:
         Raises
         ------
         LidarError
-            If a body has no valid pose.
+            If `state` is no state of the model, or if a body has no valid pose.
         """
         bodies = self._body_matrices(state)
         poses = self._poses(bodies)
@@ -240,8 +243,10 @@ class NewtonScanner:
         Raises
         ------
         LidarError
-            If a body has no valid pose, or if nothing is stationary in all worlds.
+            If an argument has a wrong type, if a body has no valid pose, or if nothing is
+            stationary in all worlds.
         """
+        time_s = _seconds(time_s)
         bodies = self._body_matrices(state)
         poses = self._poses(bodies)
         clouds: dict[int, list[Cloud]] = {}
@@ -260,8 +265,19 @@ class NewtonScanner:
         Parameters
         ----------
         world
-            Index of the world (default: all worlds).
+            Index of a world that contains a lidar (default: all worlds).
+
+        Raises
+        ------
+        LidarError
+            If no lidar belongs to the world.
         """
+        if world is not None and not (_is_index(world) and world in self.worlds):
+            found = ", ".join(map(str, dict.fromkeys(self.worlds)))
+            raise LidarError(
+                f"No lidar belongs to the world {world!r}. Pass the index of a world with a lidar "
+                f"({found}), or no argument to reset all worlds."
+            )
         for item in self._scanned:
             for lidar in item.lidars:
                 if world in (None, self._lidars.world[lidar]):
@@ -269,6 +285,11 @@ class NewtonScanner:
 
     def _body_matrices(self, state: Any) -> Floats:
         """Return the poses of all bodies. The shape is (bodies, 4, 4)."""
+        if not hasattr(state, "body_q"):
+            raise LidarError(
+                f"Expected a single newton.State, but got an object of type "
+                f"{type(state).__name__!r}. Pass for example `model.state()`."
+            )
         matrices = matrices_of(as_numpy(state.body_q, 7))
         valid = np.isfinite(matrices).all(axis=(1, 2))
         if len(matrices) != len(self._body_labels):
@@ -345,6 +366,23 @@ def _create_follower(
         for item, mesh in zip(objects[:count], named, strict=False)
     ]
     return Follower(named[count:], sensor, static=static, **options)
+
+
+def _seconds(time_s: Any) -> float:
+    """Convert a time to float, and raise LidarError if it is not a number."""
+    try:
+        if not isinstance(time_s, str):
+            return float(time_s)
+    except (TypeError, ValueError):
+        pass
+    raise LidarError(
+        "`step` expects the simulation time in seconds, followed by the state, but the time has "
+        f"the type {type(time_s).__name__!r}."
+    )
+
+
+def _is_index(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
