@@ -166,6 +166,8 @@ def test_a_capture_has_the_same_points_between_other_bounds(result):
     cloud, _, _ = result
     path = export(result, "pcap")
     truth = [open_recording(cloud).read_fired(number) for number in range(SWEEPS)]
+    for sweep, compensated in zip(truth, open_recording(cloud), strict=True):
+        np.testing.assert_array_equal(sweep.times_s, compensated.times_s)
     sweeps = [sweep.returns() for sweep in open_recording(path)]
     assert 0 <= len(cloud) - sum(map(len, sweeps)) < 384  # of the last packet, which is not full
     for number, sweep in enumerate(sweeps):

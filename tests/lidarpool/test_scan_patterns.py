@@ -286,6 +286,20 @@ def test_the_command_selects_the_form_by_extension(room, tmp_path):
         cli, ["fit", "--pattern", str(table), "--out", model, "--pose", "0,0,1"]
     )
     assert "--pose cannot be combined with --pattern" in refused.output
+    sweeps = tmp_path / "sweeps"
+    sweeps.mkdir()
+    (sweeps / "1.ply").write_text("ply")
+    for source, out, expected in (
+        (table, "mine.xml", r"extension \.yaml.* for a sensor model, or \.npz"),
+        (sweeps, "mine.yaml", r"contains \.ply files, which are not read as the sweeps.*\.pcd"),
+    ):
+        with pytest.raises(LidarError, match=expected):
+            runner.invoke(
+                cli,
+                ["fit", "--pattern", str(source), "--out", str(tmp_path / out)],
+                catch_exceptions=False,
+                standalone_mode=False,
+            )
 
 
 @pytest.mark.extended

@@ -418,8 +418,8 @@ def _fit_pattern(
     if unused:
         option = {"white": "white-intensity"}.get(unused[0], unused[0])
         raise click.UsageError(f"--{option} cannot be combined with --pattern.")
+    check_pattern_file(out)
     as_rays = out.suffix.lower() not in MODEL_FILES
-    check_pattern_file(out, as_rays=as_rays)
     fitted = fit_pattern(recording, as_rays=as_rays, sensor=sensor)
     lines = [repr(fitted), *map(click.format_filename, fitted.save(out))]
     options.print_results(fitted.figures, lines, as_json)

@@ -620,6 +620,7 @@ def open_cloud(
             saved.as_fired(index, points),
             points.columns,
             pose=saved.pose.matrix(index),
+            time_ns=float(saved.begins_ns[index]),
             compensated=False,
             firing_poses=saved.firing_poses(index, points),
         )

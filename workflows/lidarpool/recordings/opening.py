@@ -13,7 +13,7 @@ from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import join_names
 
-from ..clouds.format_table import format_of_path
+from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
@@ -143,9 +143,21 @@ def _open_path(source: RecordingSource) -> Recording:
         return _open_data_set(source)
     if (cloud_format := format_of_path(path, source.name)) is not None:
         return cloud_format.open(source)
+    if path.is_dir() and (endings := sorted({file.suffix.lower() for file in _point_files(path)})):
+        raise UnknownFormatError(
+            source.name,
+            f"It contains {join_names(endings)} files, which are not read as the sweeps of a "
+            "recording. Specify one of the files, or store the sweeps as .pcd files in a folder.",
+        )
     file_name = path.name.lower()
     advice = (text for ending, text in _CONVERSIONS.items() if file_name.endswith(ending))
     raise UnknownFormatError(source.name, next(advice, ""))
+
+
+def _point_files(folder: Path) -> list[Path]:
+    """Return the files in a folder that can be opened one by one."""
+    endings = {ending for ending in formats_of_endings() if ending}
+    return [file for file in folder.iterdir() if file.suffix.lower() in endings and file.is_file()]
 
 
 def _open_data_set(source: RecordingSource) -> Recording:

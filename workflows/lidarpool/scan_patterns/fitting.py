@@ -82,14 +82,20 @@ _DISK_ADVICE = "choose an existing folder with enough free space"
 _NOT_RECORDED = ("beam divergence", "returns per pulse", "noise")
 
 
-def check_pattern_file(path: Path, *, as_rays: bool) -> None:
-    """Raise LidarError unless a file name extension matches a pattern."""
-    endings = RAY_FILES if as_rays else MODEL_FILES
+def check_pattern_file(path: Path, *, as_rays: bool | None = None) -> None:
+    """Raise LidarError unless a file name extension matches a pattern.
+
+    If `as_rays` is None, the pattern may be a sensor model or a list of rays.
+    """
+    model = f"{' or '.join(MODEL_FILES)} for a sensor model"
+    rays = f"{' or '.join(RAY_FILES)} for a list of rays"
+    if as_rays is None:
+        endings, advice = (*MODEL_FILES, *RAY_FILES), f"{model}, or {rays}"
+    else:
+        endings, advice = (RAY_FILES, rays) if as_rays else (MODEL_FILES, model)
     if path.suffix.lower() not in endings:
-        kind = "a list of rays" if as_rays else "a sensor model"
         raise LidarError(
-            f"{path} cannot contain {kind}. Use a file name with the extension "
-            f"{' or '.join(endings)}."
+            f"{path} cannot contain the scan pattern. Use a file name with the extension {advice}."
         )
 
 
