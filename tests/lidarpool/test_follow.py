@@ -24,6 +24,7 @@ from lidarpool import LidarError, Pose, Scanner, Scene, Sensor, load_sensor
 from lidarpool.cli.follow_command import follow
 from lidarpool.clouds.ros.messages import RosMessage, message_store
 from lidarpool.following.node import FollowOptions
+from lidarpool.following.notices import Notices
 from lidarpool.following.opening import FollowSources, create_node
 from lidarpool.following.pose_input import is_wanted
 from lidarpool.scenario.sensors_file import SensorsFile
@@ -440,6 +441,37 @@ def test_poses_of_another_clock_are_stated(folder):
         loop.send(transforms(1.7e9, [("crate", "room", (2, 0, 0.5), 0.0)]))
         loop.play(lambda _: STILL, 0.12, 0.3)
     assert notes_of(loop, "Poses of crate are ignored, because their time differs from /clock by")
+
+
+def test_poses_of_a_restarted_simulator_may_arrive_before_its_clock(folder, monkeypatch):
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 35, 35.3)
+        loop.send(transforms(0.1, STILL))  # the clock of the killed simulator still applies
+        loop.do_what_is_due()
+        loop.play(lambda _: STILL, 0.12, 0.5)
+    assert len(loop.notes) == 1 and "jumped back from 35.300 to 0.120 s" in loop.notes[0]
+
+
+def test_the_clock_is_stated_after_waiting(folder, monkeypatch):
+    monkeypatch.setattr("lidarpool.following.node._QUIET_S", 0)
+    with Loop("room.sdf") as loop:
+        loop.do_what_is_due()
+        monkeypatch.setattr("lidarpool.following.node._QUIET_S", 60)
+        loop.play(lambda _: STILL, 0, 0.3)
+    waiting, received = loop.notes
+    assert waiting.endswith("Waiting.") and received == "Messages on /clock are arriving."
+
+
+def test_repeated_events_are_counted(monkeypatch):
+    shown: list[str] = []
+    notices = Notices(shown.append)
+    for count in (1, 2):
+        for _ in range(count):
+            notices.show_event("key", "An event.")
+        monkeypatch.setattr("lidarpool.following.notices._PERIOD_S", -1)
+        notices.show_event("key", "An event.")
+        monkeypatch.undo()
+    assert shown == ["An event.", "An event.", "An event. (2 more such events were not shown.)"]
 
 
 def test_poses_that_are_rare_are_stated_and_held(folder):

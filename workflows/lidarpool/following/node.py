@@ -222,14 +222,17 @@ class FollowNode:
     def _set_clock(self, time_ns: int) -> None:
         """Set the simulation time. The sweeps are restarted if it has jumped."""
         last_ns = self._poses.clock_ns
-        self._poses.clock_ns = time_ns
         self._clock_s = time.monotonic()
-        self._notices.clear("quiet")
+        has_jumped = last_ns is not None and not 0 <= time_ns - last_ns <= _MAX_CLOCK_STEP_NS
+        if has_jumped:
+            self._poses.restart()
+        self._poses.set_clock(time_ns)
+        if self._notices.clear("quiet"):
+            self._notices.show_event("clock received", "Messages on /clock are arriving.")
         if last_ns is None:
             self._restart(time_ns)
-        elif time_ns < last_ns or time_ns > last_ns + _MAX_CLOCK_STEP_NS:
+        elif has_jumped:
             self._tree.restart(time_ns)
-            self._poses.restart()
             self._restart(time_ns)
             direction = "back" if time_ns < last_ns else "ahead"
             self._notices.show_event(

@@ -39,7 +39,10 @@ class Notices:
             self._events[key] = (shown_s, count + 1)
             return
         self._events[key] = (now_s, 0)
-        self._show(f"{text} ({count:,} such events were not shown.)" if count else text)
+        if count:
+            noun, verb = ("event", "was") if count == 1 else ("events", "were")
+            text += f" ({count:,} more such {noun} {verb} not shown.)"
+        self._show(text)
 
     def show_names(self, key: str, names: Collection[str], text: str) -> None:
         """Show a notice about those names for which it was not shown before.
@@ -51,6 +54,11 @@ class Notices:
             self._shown.update((key, name) for name in new)
             self._show(text.format(names=list_names(new, MAX_NAMES)))
 
-    def clear(self, key: Hashable) -> None:
-        """Allow a notice to be shown again, because its cause is gone."""
+    def clear(self, key: Hashable) -> bool:
+        """Allow a notice to be shown again, because its cause is gone.
+
+        Returns whether it was shown.
+        """
+        was_shown = key in self._shown
         self._shown.discard(key)
+        return was_shown

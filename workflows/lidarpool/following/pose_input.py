@@ -38,6 +38,9 @@ _MODEL_POSES = (_TRANSFORMS, _STAMPED_TRANSFORM, _STAMPED_POSE, _POSE)
 _MAX_AHEAD_NS = 1_000_000_000
 _MAX_BEHIND_NS = 10_000_000_000
 _MAX_FRAMES = 10_000
+# Poses whose time differs from the clock are reported after this number of further clock messages,
+# unless one of them shows that the clock has jumped.
+_MIN_CLOCKS = 2
 _SETTLE_S = 1.0  # how long poses from before a jump of the clock may still arrive
 
 
@@ -81,6 +84,9 @@ class PoseInput:
         self._robots: list[RobotFrames] = []
         self.clock_ns: int | None = None  # last time that was received
         self.last_ns: int | None = None  # time of the last pose over time, since the last jump
+        # Frame of an ignored pose, and its time relative to the clock in nanoseconds
+        self._off_clock: tuple[str, int] | None = None
+        self._clocks = 0  # clock messages since the pose was ignored
         self._jumped_s = -_SETTLE_S  # when the clock last jumped, as `time.monotonic`
 
     def add_robots(self, robots: Sequence[RobotFrames]) -> None:
@@ -90,7 +96,25 @@ class PoseInput:
     def restart(self) -> None:
         """Forget when the last pose was received, because the clock has jumped."""
         self.last_ns = None
+        self._off_clock = None
         self._jumped_s = time.monotonic()
+
+    def set_clock(self, time_ns: int) -> None:
+        """Set the simulation time. Show a notice if it continues and poses were ignored."""
+        self.clock_ns = time_ns
+        if self._off_clock is None:
+            return
+        self._clocks += 1
+        if self._clocks < _MIN_CLOCKS:
+            return
+        frame, difference_ns = self._off_clock
+        self._off_clock = None
+        self._notices.show_event(
+            "clock",
+            f"Poses of {frame} are ignored, because their time differs from /clock by "
+            f"{format_rounded(difference_ns / 1e9)} s. Set use_sim_time in the node that "
+            "publishes them.",
+        )
 
     def read(self, message: RosMessage) -> int | None:
         """Add the poses in a message. Return the time if it is a clock message.
@@ -189,13 +213,11 @@ class PoseInput:
         if not is_static and clock_ns is not None:
             time_ns = time_ns or clock_ns
             if not clock_ns - _MAX_BEHIND_NS <= time_ns <= clock_ns + _MAX_AHEAD_NS:
-                if time.monotonic() - self._jumped_s > _SETTLE_S:
-                    self._notices.show_event(
-                        "clock",
-                        f"Poses of {frame} are ignored, because their time differs from /clock by "
-                        f"{format_rounded((time_ns - clock_ns) / 1e9)} s. Set use_sim_time in the "
-                        "node that publishes them.",
-                    )
+                is_settled = time.monotonic() - self._jumped_s > _SETTLE_S
+                if is_settled and self._off_clock is None:
+                    # The simulator may have restarted, and its clock may arrive after its poses.
+                    self._off_clock = frame, time_ns - clock_ns
+                    self._clocks = 0
                 return
         if len(self._tree.received) >= _MAX_FRAMES and frame not in self._tree.received:
             self._notices.show(

@@ -148,7 +148,7 @@ def fit_pattern(
         recording = open_recording(recording, sensor, name="the recording")
     returns = PatternReturns.read(recording)
     notes = [*returns.notes, *check_stationary(recording, returns)]
-    if recording.compensated:
+    if recording.compensated and recording.fired is None:
         notes.append("the recording states that its points are motion-compensated")
     if "channel" not in _columns(recording) and len(recording.rings):
         notes.append(recording.rings.note.removesuffix("."))
