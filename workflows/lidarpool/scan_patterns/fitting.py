@@ -89,10 +89,12 @@ def check_pattern_file(path: Path, *, as_rays: bool | None = None) -> None:
     """
     model = f"{' or '.join(MODEL_FILES)} for a sensor model"
     rays = f"{' or '.join(RAY_FILES)} for a list of rays"
-    if as_rays is None:
-        endings, advice = (*MODEL_FILES, *RAY_FILES), f"{model}, or {rays}"
-    else:
-        endings, advice = (RAY_FILES, rays) if as_rays else (MODEL_FILES, model)
+    allowed: dict[bool | None, tuple[tuple[str, ...], str]] = {
+        None: ((*MODEL_FILES, *RAY_FILES), f"{model}, or {rays}"),
+        False: (MODEL_FILES, model),
+        True: (RAY_FILES, rays),
+    }
+    endings, advice = allowed[as_rays]
     if path.suffix.lower() not in endings:
         raise LidarError(
             f"{path} cannot contain the scan pattern. Use a file name with the extension {advice}."
