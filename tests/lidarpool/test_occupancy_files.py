@@ -66,6 +66,7 @@ def voxel_of(point):
     return tuple(np.floor((np.array(point) - (0, -25.6, -2)) / 0.2).astype(int))
 
 
+@pytest.mark.extended
 def test_semantickitti_stores_labels_and_bits_in_its_order(kitti):
     label = np.fromfile(kitti / "000000.label", "<u2").reshape(256, 256, 32)
     instance = np.fromfile(kitti / "000000.instance", "<u2").reshape(256, 256, 32)

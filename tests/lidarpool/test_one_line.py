@@ -104,7 +104,15 @@ def test_every_public_class_is_among_them():
     # recordings have tests of their own. The scanners of MuJoCo and Newton require these programs,
     # and views of scanners require a viewer.
     elsewhere = {"Result", "Comparison", "Fit", "PatternFit", "Twin", "Robot", "ScanSpec", "Sweep"}
-    elsewhere |= {"LidarError", "MujocoScanner", "NewtonScanner", "Foxglove", "Rerun", "Recording"}
+    elsewhere |= {
+        "SurveyComparison",
+        "LidarError",
+        "MujocoScanner",
+        "NewtonScanner",
+        "Foxglove",
+        "Rerun",
+        "Recording",
+    }
     public = {n for n in lidarpool.__all__ if isinstance(getattr(lidarpool, n), type)}
     parts = {"Imu", "Gnss"}  # of Navigation
     assert (

@@ -300,6 +300,7 @@ def test_surfaces_are_as_bright_as_they_were(place):
     np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.2)
 
 
+@pytest.mark.extended
 def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     files = place.save(tmp_path / "twin")
     assert {file.name for file in files} == {

@@ -256,6 +256,7 @@ def test_numbers_of_returns_from_spray():
     assert each.var() == pytest.approx(each.mean(), rel=0.05), "Poisson's"
 
 
+@pytest.mark.extended
 def test_spray_takes_light_from_what_is_behind_it():
     dense = 0.5 * (SPEED / 25) ** 2 * math.exp(-0.2 / 0.4)
     with_spray, without = (sprayed(car(spray=on), [wall("W", 20)]) for on in (True, False))

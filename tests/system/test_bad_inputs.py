@@ -26,7 +26,7 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
     "no scenario": ("s.yaml", None, "s.yaml does not exist"),
     "not YAML": ("s.yaml", b"scene: [seed\n", "s.yaml, line 2: "),
     "misspelt field": ("s.yaml", b"sensor: {layer: 3}\n", "Did you mean 'layers'?"),
-    "misspelt mesh": ("s.yaml", b"scene: {files: [b.stl]}\n", "Did you mean 'a.stl'?"),
+    "misspelt mesh": ("s.yaml", b"scene: {files: [aa.stl]}\n", "Did you mean 'a.stl'?"),
     "two fields": (
         "s.yaml",
         b"scene: seed\nplanning: {start: [25, 25], target: [25, 25]}\n",

@@ -113,6 +113,7 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     np.testing.assert_array_equal(found["ring"].numpy()[:, 0], cloud.channel)
 
 
+@pytest.mark.extended
 def test_points_and_cloud_are_saved_alike_with_every_column(result, tmp_path):
     save_cloud(result.points, tmp_path / "points.laz")
     save_cloud(result.cloud, tmp_path / "cloud.laz")

@@ -719,6 +719,7 @@ def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots
 # -- shards ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.extended
 def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
     before = content(parts[1])
     run = ["run", parts[0].parent / "c.yaml", "-q", "--scheduler", slots, "--out", parts[1]]

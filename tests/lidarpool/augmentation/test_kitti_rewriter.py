@@ -223,8 +223,9 @@ def test_labels_of_the_object_benchmark(benchmark, tmp_path):
 
 
 def test_open3d_ml_reads_the_box_of_an_inserted_car(benchmark, tmp_path):
-    """Its reader requires scikit-learn."""
+    """Its reader requires packages that Open3D does not install everywhere."""
     pytest.importorskip("sklearn")
+    pytest.importorskip("addict")
     from open3d._ml3d.datasets.kitti import KITTI
 
     folder, _ = benchmark

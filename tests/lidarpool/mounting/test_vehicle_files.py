@@ -163,6 +163,7 @@ def test_names_of_mounts_must_agree():
         load(data)
 
 
+@pytest.mark.extended
 def test_the_ranking_is_written(folder):
     Path("car.yaml").write_text(yaml.safe_dump(SMALL))
     outcome = mount("car.yaml", "--workers", "1")
