@@ -215,7 +215,7 @@ def test_files_contain_the_accuracy(room, tmp_path):
     rays = fit_pattern(recording, as_rays=True)
     text = rays.save(tmp_path / "mine.csv")[0].read_text()
     assert "standard deviation 0.00" in text.split("\n# notes:")[1].splitlines()[0]
-    with pytest.raises(LidarError, match=r"mine\.yaml cannot contain a list of rays"):
+    with pytest.raises(LidarError, match=r"mine\.yaml cannot contain the scan pattern"):
         rays.save(tmp_path / "mine.yaml")
 
 
