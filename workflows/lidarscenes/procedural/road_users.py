@@ -38,7 +38,7 @@ def cyclist() -> SceneMesh:
     --------
     >>> rider = cyclist()
     >>> np.ptp(rider.bounds, axis=0).round(1).tolist()
-    [1.7, 0.5, 1.8]
+    [1.7, 0.6, 1.8]
     """
     wheel = lay_down(loft(regular_polygon(16, _WHEEL_M), [(-0.02, 0.01), (0.02, 0.01)]))
     lift = -float(wheel.vertices[:, 2].min())

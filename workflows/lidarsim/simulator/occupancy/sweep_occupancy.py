@@ -39,8 +39,8 @@ class OccupancySimulator:
 
     Examples
     --------
-    >>> from lidarpool import Scene, Sensor, Survey
-    >>> survey = Survey(Sensor(8, 4, 30.0), poses=[(0, 0, 1)])
+    >>> from lidarpool import Scene, Survey, load_sensor
+    >>> survey = Survey(load_sensor("velodyne/vlp16"), poses=[(0, 0, 1)])
     >>> grid = VoxelGrid((-2, -2, -1), (2, 2, 1), 0.5)
     >>> OccupancySimulator(Scene.seed(), survey, grid).sweep(0).classes.shape
     (8, 8, 4)
