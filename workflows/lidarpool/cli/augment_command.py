@@ -233,12 +233,7 @@ class _Placement(NamedTuple):
     help="Augment only these sweeps, for example 0:100, and keep the others unchanged.",
 )
 @options.scheduler
-@click.option(
-    "--workers",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Number of processes on this machine (default: depends on cores and memory).",
-)
+@options.workers
 @options.flag("--resume", help="Resume an unfinished augmentation, if there is one.")
 @overwrite
 @options.flag("--quiet", "-q", help="Do not show progress.")

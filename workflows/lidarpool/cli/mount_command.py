@@ -33,12 +33,7 @@ _SHOWN = 10  # candidates in the printed table
     help="Output folder (default: named after the vehicle file).",
 )
 @options.scheduler
-@click.option(
-    "--workers",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Number of processes (default: depends on the number of cores and the memory).",
-)
+@options.workers
 @overwrite
 @options.as_json
 def mount(

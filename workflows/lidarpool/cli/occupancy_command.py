@@ -82,12 +82,7 @@ def _parse_extent(text: str) -> Corners:
 )
 @options.backend
 @options.scheduler
-@click.option(
-    "--workers",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Number of processes on this machine (default: depends on cores and memory).",
-)
+@options.workers
 @overwrite
 @options.flag("--quiet", "-q", help="Do not show progress.")
 @options.as_json

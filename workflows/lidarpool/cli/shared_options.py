@@ -207,6 +207,14 @@ def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
             yield item if isinstance(item, str) else ",".join(map(str, item))
 
 
+workers = click.option(
+    "--workers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Number of processes on this machine (default: depends on cores and memory).",
+)
+
+
 def scheduler(command: Command) -> Command:
     """Add the options for connecting to a running scheduler.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,20 +11,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.errors import explain_os_errors
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
-from ..clouds.folder import result_folder, staging
 from ..report.page.rendering import millimeters, render_template
+from .comparison_files import write_comparison
 from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
-# Pictures of all comparisons, including those of surveys.
-PICTURES = ("ranges", "rings", "distances", "above", "map", "histogram")
 # States of a cell. The first three name the clouds in which the cell has no return.
 CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
 
@@ -75,28 +71,12 @@ class Comparison:
         LidarError
             If the folder cannot be written to.
         """
-        path = Path(folder)
-        with (
-            result_folder(path),
-            explain_os_errors(
-                f"The comparison cannot be written to {path}", "free some disk space"
-            ),
-            staging(path) as staged,
-        ):
-            pages = {"distances": draw_distances(self), "above": draw_above(self)}
-            if self.images is not None:
-                pages = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | pages
-            pictures = {name: page.svg() for name, page in pages.items()}
-            text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
-            report = render_template("comparison.html", report=self.figures, pictures=pictures)
-            files = {"compare.json": text.encode(), "compare.html": report.encode()}
-            files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
-            for name, content in files.items():
-                (staged / name).write_bytes(content)
-            for name in PICTURES:
-                if name not in pages:
-                    (path / f"compare-{name}.png").unlink(missing_ok=True)
-            return [(staged / name).replace(path / name) for name in files]
+        pages = {"distances": draw_distances(self), "above": draw_above(self)}
+        if self.images is not None:
+            pages = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | pages
+        pictures = {name: page.svg() for name, page in pages.items()}
+        report = render_template("comparison.html", report=self.figures, pictures=pictures)
+        return write_comparison(folder, self.figures, report, pages)
 
 
 class _ImageLayout(NamedTuple):

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lidarsim.errors import explain_os_errors
 from lidarsim.numerics.arrays import Floats
 
-from ...clouds.folder import result_folder, staging
 from ...report.page.rendering import render_template
-from ..comparison import PICTURES
+from ..comparison_files import write_comparison
 from .deviations import STATISTICS
 from .survey_charts import draw_histograms, draw_maps
 
@@ -64,32 +61,13 @@ class SurveyComparison:
         LidarError
             If the folder cannot be written to.
         """
-        path = Path(folder)
-        with (
-            result_folder(path),
-            explain_os_errors(
-                f"The comparison cannot be written to {path}", "free some disk space"
-            ),
-            staging(path) as staged,
-        ):
-            pages = {
-                "map": draw_maps(self.figures, self.points, self.components, LABELS),
-                "histogram": draw_histograms(self.figures, self.components, LABELS),
-            }
-            pictures = {name: page.svg() for name, page in pages.items()}
-            report = render_template(
-                "survey.html", report=self.figures, pictures=pictures, labels=LABELS
-            )
-            text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
-            files = {
-                "compare.json": text.encode(),
-                "compare.csv": self.table().encode(),
-                "compare.html": report.encode(),
-            }
-            files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
-            for name, content in files.items():
-                (staged / name).write_bytes(content)
-            for name in PICTURES:
-                if name not in pages:
-                    (path / f"compare-{name}.png").unlink(missing_ok=True)
-            return [(staged / name).replace(path / name) for name in files]
+        pages = {
+            "map": draw_maps(self.figures, self.points, self.components, LABELS),
+            "histogram": draw_histograms(self.figures, self.components, LABELS),
+        }
+        pictures = {name: page.svg() for name, page in pages.items()}
+        report = render_template(
+            "survey.html", report=self.figures, pictures=pictures, labels=LABELS
+        )
+        texts = {"compare.csv": self.table()}
+        return write_comparison(folder, self.figures, report, pages, texts)
