@@ -1,11 +1,11 @@
-"""Measure which costs of reconstructing a twin grow with the length of the drive.
+"""Measure which costs of twin reconstruction grow with the length of the drive.
 
     python -m benchmarks.long_drives [--periods 1 2 4 8]
 
-A street repeats every 48 m, and so does the car that comes towards the sensor. One period of a
-drive at 10 m/s is simulated, and its sweeps are repeated with shifted poses, so that the recording
-of any length is consistent. The recording is then reconstructed on a local cluster. The measured
-process contains the driver and the scheduler, and the workers are other processes.
+The street and the oncoming cars repeat every 48 m. One period of a drive at 10 m/s is simulated,
+and its sweeps are repeated with shifted poses, so that recordings of any length are consistent. The
+recording is then reconstructed on a local cluster. The driver and the scheduler run in the measured
+process, and the workers in separate processes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _PERIOD_SWEEPS = 48
 _STEP_M = 1.0  # between sweeps, which are 0.1 s apart
 _SWEEP_S = 0.1
 _PERIOD_M = _PERIOD_SWEEPS * _STEP_M
-_PERIODS_AROUND = 3  # periods of the street before and after the simulated one
+_PERIODS_AROUND = 3  # street periods before and after the simulated period
 _CAR_M_S = -6.0
 _CAR_START_M = 40.0
 _HEIGHT_M = 1.9
@@ -55,7 +55,7 @@ DATA binary
 
 
 def street() -> trimesh.Trimesh:
-    """Return a street with houses, gaps between them, parked boxes and poles."""
+    """Return a street with houses, gaps between them, parked cars as boxes, and poles."""
     random = np.random.default_rng(3)
     length_m = (2 * _PERIODS_AROUND + 1) * _PERIOD_M
     ground = _box((length_m, 40, 0.2), (_PERIOD_M / 2, 0, -0.1))
@@ -81,7 +81,7 @@ def _box(size: Sequence[float], center: Sequence[float]) -> trimesh.Trimesh:
 
 
 def simulate_period(model: str, columns: int) -> list[Sweep]:
-    """Simulate the sweeps of one period, with a car ahead in this period and its neighbors."""
+    """Simulate the sweeps of one period, with an oncoming car in this period and its neighbors."""
     end_s = _SWEEP_S * (_PERIOD_SWEEPS + 1)
     times_s = np.array([0.0, end_s])
     oncoming = np.tile([0.0, 0.0, 1.0, 0.0], (2, 1))
@@ -134,7 +134,7 @@ def write_drive(folder: Path, sweeps: Sequence[Sweep], period_count: int) -> Pat
 
 
 def reconstruct(folder: Path) -> dict[str, Any]:
-    """Reconstruct a drive in this process and its workers, and return what it cost."""
+    """Reconstruct a drive in this process and its workers, and return the cost."""
     steps = folder / "steps"
     largest = [0]
     ended = threading.Event()
@@ -162,7 +162,7 @@ def reconstruct(folder: Path) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure drives of several lengths, and print and return a row for each."""
+    """Measure drives of several lengths. Print and return one row per drive."""
     parser = argument_parser(__doc__)
     parser.add_argument("--periods", type=int, nargs="+", default=[3, 6, 12, 24])
     parser.add_argument("--sensor", default="ouster/os1-32")

@@ -1,4 +1,4 @@
-"""Measure lidars in the worlds of a Newton model.
+"""Measure the simulation of lidars in the worlds of a Newton model.
 
     python -m benchmarks.newton
 
@@ -27,7 +27,7 @@ SPACING_M = 12.0  # between worlds that see each other
 
 
 def build(worlds: int, spacing_m: float) -> Any:
-    """Return a Newton model of worlds with a quadruped and obstacles each."""
+    """Return a Newton model whose worlds each contain a quadruped and obstacles."""
     import newton
 
     world = newton.ModelBuilder()
@@ -91,7 +91,7 @@ class NewtonRays:
 
 
 class Created(NamedTuple):
-    """A scanner, or several, and what their creation took."""
+    """One or more scanners, and the cost of creating them."""
 
     scanners: list[NewtonScanner]
     seconds: float  # CPU time
@@ -99,7 +99,7 @@ class Created(NamedTuple):
 
 
 def create(model: Any, choices: list[dict[str, Any]]) -> Created:
-    """Create a scanner for each choice of lidars."""
+    """Create a scanner for each selection of lidars."""
     sensor = load_sensor("velodyne/vlp16")
     process = psutil.Process()
     before = process.memory_info().rss

@@ -1,10 +1,10 @@
-"""CPU time of `lidarpool serve` per request.
+"""Measure the CPU time of `lidarpool serve` per request.
 
     python -m benchmarks.serve [--sweeps 30]
 
 The service runs in its own process, in a city of 100,000 triangles. The client drives through the
-city at 10 m/s among 20 cars that move as well, and requests one sweep after the other. For each
-sensor, the CPU time of the service is compared with that of the same sweeps without a server.
+city at 10 m/s among 20 moving cars, and requests one sweep after another. For each sensor, the CPU
+time of the service is compared with the CPU time of the same sweeps without a server.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from lidarpool.serving.served_scene import load_served_scene
 
 SENSORS = ("velodyne/vlp16", "hesai/at128", "hesai/pandar128")
 CARS = 20
-_WARM = 5  # requests that are not measured
+_WARM = 5  # warm-up requests, which are not measured
 _SWEEP_US = 100_000
 _LIMIT = [("grpc.max_receive_message_length", 1 << 27)]
 
 
 def main() -> None:
-    """Measure each sensor, and print a line for it."""
+    """Measure each sensor, and print one line per sensor."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sweeps", type=int, default=30, help="measured requests per sensor")
     arguments = parser.parse_args()
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def scenario_of(folder: Path) -> Path:
-    """Write the scene, and return its scenario."""
+    """Write the scene and its scenario, and return the path of the scenario."""
     command = [sys.executable, "-m", "lidarpool", "scene", "city", str(folder / "city.glb")]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     points = [{"time_s": 0, "position": [0, 0, 0]}, {"time_s": 9, "position": [9, 0, 0]}]
@@ -88,7 +88,7 @@ def _pair(start: Any, end: Any) -> dict[str, Any]:
 
 
 def measure(scene: Path, model: str, count: int) -> dict[str, Any]:
-    """Return the CPU times and the size of the replies."""
+    """Return the times per request and the size of the replies."""
     cpu_s = []
     wall_s = []
     points = []
@@ -128,7 +128,7 @@ def service(scene: Path, model: str) -> Iterator[tuple[psutil.Process, str]]:
 
 
 def local_cpu_s(scene: Path, model: str, count: int) -> float:
-    """Return the CPU time of a sweep without the service."""
+    """Return the CPU time per sweep without the service."""
     sensor = load_served_scene(scene, {0: model}, lambda note: None).sensors[0]
     for number in range(_WARM + count):
         if number == _WARM:

@@ -465,10 +465,10 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays in a tile from their indices, in local coordinates.
 
     `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
-    scan, and `count` is the number of rays in the call, or 0 for any rays of the scan. The tile may
-    also contain neighboring rays that do not belong to the call. If all rays share an origin,
-    `write_shared_origin` must have written it to the tile. The rays are also written to the ray
-    outputs of the cast, if there are any.
+    scan, and `count` is the number of rays in the call, or 0 if the rays can be anywhere in the
+    scan. The tile may also contain neighboring rays that do not belong to the call. If all rays
+    share an origin, `write_shared_origin` must have written it to the tile. The rays are also
+    written to the ray outputs of the cast, if there are any.
     """
     cast = carray(casts_at(address), 1)[0]
     tile = cast.tile

@@ -224,7 +224,7 @@ class TileBackend(Backend):
     def _cast(self, cast: CastRecord, cuts: Sequence[int], plan: TilePlan) -> HitColumns:
         """Cast consecutive ranges of rays, and return their hits in ray order.
 
-        `cuts` contains the first ray of each range, and finally the end of the last range. Rays in
+        `cuts` contains the first ray of each range, followed by the end of the last range. Rays in
         different ranges do not share a tile. Ray indices are relative to the first ray.
 
         Distances are in meters. `triangle` contains indices in the caller's faces, or rows of the

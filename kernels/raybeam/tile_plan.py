@@ -22,7 +22,8 @@ _MAX_LANES = 1 << 20
 # Rings are not shifted in scans with fewer firings than this multiple of the largest shift, because
 # too many tiles would be incomplete.
 _FEW_FIRINGS = 4
-# Casting smaller images one by one would take longer than casting a few tiles with rays of two.
+# Casting smaller images separately would take longer than casting a few tiles with rays from two
+# images.
 _MIN_IMAGE_RAYS = 1024
 
 
@@ -55,11 +56,11 @@ class TilePlan(NamedTuple):
 
 
 def image_rays(scan: Scan, firing: int) -> int:
-    """Return the rays per image if the scan consists of several large images, otherwise 0.
+    """Return the number of rays per image if a scan consists of several large images, otherwise 0.
 
     All rays of an image have the same pose. The poses of images can be far apart, whereas a moving
-    lidar has a pose for each firing. A tile with rays of two images would test all triangles
-    between them.
+    lidar has a pose for each firing. A tile with rays from two images would test all triangles
+    between the images.
     """
     rays = scan.poses.rays_per_pose
     return rays if max(firing, _MIN_IMAGE_RAYS) < rays < len(scan) else 0

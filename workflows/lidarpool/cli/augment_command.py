@@ -279,8 +279,8 @@ def augment(
         raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
     if workers is not None and scheduler is not None:
         raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
-            "the cluster."
+            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
+            "workers of the cluster."
         )
     if partial and sensor is None:
         raise click.UsageError("`--partial` requires `--sensor`.")

@@ -99,7 +99,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
     "--survey",
     type=click.Choice(SURVEY_METHODS),
     help="Compare surveys in world coordinates: ΔE, ΔN and Δh of paired points, distances from "
-    "planes, M3C2, signed distances from a mesh, or height differences of strips.",
+    "planes, M3C2, signed distances from a mesh, or height differences between strips.",
 )
 @click.option(
     "--up-axis",
@@ -111,7 +111,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
     "radius_m",
     type=float,
     metavar="M",
-    help="Radius in meters of the planes and cylinders (default: from the point density of B). "
+    help="Radius of the planes and cylinders in meters (default: from the point density of B). "
     "With --survey planes or m3c2.",
 )
 @click.option(
@@ -128,7 +128,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
     metavar="M",
     default=1.0,
     show_default=True,
-    help="Width in meters of the cells in which strips are compared. With --survey strips.",
+    help="Width of the cells in which strips are compared, in meters. With --survey strips.",
 )
 @click.option(
     "--max-roughness",
@@ -137,7 +137,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
     metavar="M",
     default=0.1,
     show_default=True,
-    help="Maximum standard deviation in meters of points from the plane of their cell. With "
+    help="Maximum standard deviation of points from the plane of their cell, in meters. With "
     "--survey strips.",
 )
 @options.as_json

@@ -35,7 +35,7 @@ GEOJSON_FILE = "flight.geojson"
 KML_FILE = "flight.kml"
 FILES = (SCENARIO_FILE, PATH_FILE, PICTURE_FILE, GEOJSON_FILE, KML_FILE)
 _SHOWN_LINES = 20  # maximum number of lines listed individually
-_STEP_DEG = 360  # time step in degrees of the scanner's cycle: one cycle per scan
+_STEP_DEG = 360  # time step in degrees of the scanner's cycle, so one cycle per scan
 _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degrees
 # Level ground extends beyond the trajectory by this multiple of half the swath.
 _GROUND_MARGIN = 1.5
@@ -68,7 +68,7 @@ def _parse_speeds(text: str) -> tuple[float, float]:
         speeds = math.nan, math.nan
     if speeds[0] > speeds[1]:
         raise click.BadParameter(
-            f"{text!r} is not a valid range of speeds, because the lower limit comes first. Use "
+            f"{text!r} is not a valid speed range, because the lower limit must come first. Use "
             f"`--speed {high}-{low}`."
         )
     if not 0.1 <= speeds[0] <= speeds[1] <= 400:
@@ -83,7 +83,7 @@ class _FlightCommand(click.Command):
     """A command whose arguments can be bounds that start with a minus sign."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Prefix such bounds with a space, so that they are not parsed as an option."""
+        """Prefix such bounds with a space, so that they are not parsed as options."""
         return super().parse_args(
             ctx, [f" {text}" if _NEGATIVE_BOUNDS.match(text) else text for text in args]
         )
@@ -126,8 +126,8 @@ class _FlightCommand(click.Command):
     "density_m2",
     type=click.FloatRange(0, 1e5, min_open=True),
     metavar="N",
-    help="Number of points per square meter in each strip (default: as many as there are at the "
-    "maximum speed and pulse rate).",
+    help="Number of points per square meter in each strip (default: the density at the maximum "
+    "speed and pulse rate).",
 )
 @click.option(
     "--speed",
@@ -135,15 +135,15 @@ class _FlightCommand(click.Command):
     type=_parse_speeds,
     default="3-70",
     metavar="M/S",
-    help="Speed over ground in m/s, or the limits within which it is chosen.",
+    help="Speed over ground in m/s, or a range from which it is chosen.",
 )
 @click.option(
     "--fov",
     "fov_deg",
     type=click.FloatRange(1, 170),
     metavar="DEG",
-    help="Field of view across the track that the plan uses, in degrees (default: that of the "
-    "sensor, at most 90).",
+    help="Planned field of view across the track in degrees (default: that of the sensor, at most "
+    "90).",
 )
 @click.option(
     "--heading",
@@ -183,11 +183,11 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     whose extent is the area. GeoJSON contains longitudes and latitudes. WKT and bounds are in the
     coordinates of the terrain, in meters.
 
-    The lines are parallel to the longest side of the area, and their spacing results in the
-    overlap. The speed, the pulse rate and the scan frequency are chosen within the limits of the
-    sensor so that each strip has the density. The output is a scenario for `lidarpool run`, a map
-    with the expected density, and the plan as GeoJSON and KML. Notes state which requirements
-    cannot be met, and what to change.
+    The lines are parallel to the longest side of the area, and spaced so that adjacent strips have
+    the requested overlap. The speed, the pulse rate and the scan frequency are chosen within the
+    limits of the sensor so that each strip has the requested density. The output is a scenario for
+    `lidarpool run`, a map with the expected density, and the plan as GeoJSON and KML. Notes state
+    which requirements cannot be met, and what to change.
 
     \b
     Examples:
@@ -238,10 +238,10 @@ class _Site(NamedTuple):
     """Area and ground of a flight plan."""
 
     name: str
-    shape: Any  # polygon of shapely in the coordinates of the scenario
+    shape: Any  # Shapely polygon in scenario coordinates
     terrain: Any
     scenario: Scenario | None  # scenario with the terrain, or None for level ground
-    epsg: int | None  # EPSG code of the coordinates of the scenario plus `origin`
+    epsg: int | None  # EPSG code of the scenario coordinates plus `origin`
     origin: Floats  # (3,), world origin of the scenario, meters
     notes: list[str]
 
@@ -320,7 +320,7 @@ def _in_system(drawn: Any, epsg: int | None) -> Any:
 
 
 def _area_name(area: str) -> str:
-    """Return a name for the output folder: the name of the file, or area."""
+    """Return a name for the output folder, which is the name of the area file or "area"."""
     path = Path(area)
     return path.stem if path.suffix in (".geojson", ".json", ".wkt", ".txt") else "area"
 
@@ -372,7 +372,7 @@ def _yaml(data: dict[str, Any]) -> str:
 
 
 def _scenario_data(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any]:
-    """Return the content of the scenario: the scanner, once per line, along the path."""
+    """Return the content of the scenario, in which the scanner has one entry per flight line."""
     parts = getattr(plan.area, "geoms", [plan.area])
     rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
     return {

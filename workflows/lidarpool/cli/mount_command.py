@@ -1,4 +1,4 @@
-"""The `lidarpool mount` command, which compares the mounting positions of lidars on a vehicle."""
+"""The `lidarpool mount` command, which compares mounting positions of lidars on a vehicle."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def mount(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Compare the mounting positions of lidars on a vehicle.
+    """Compare mounting positions of lidars on a vehicle.
 
     VEHICLE.yaml describes the body of the vehicle, the sensors with candidate mounts or ranges to
     search, and the targets that they must detect. All beams of each sensor are simulated with the
@@ -63,8 +63,8 @@ def mount(
     """  # noqa: D301 - Click requires the character \b
     if workers is not None and scheduler is not None:
         raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
-            "the cluster."
+            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
+            "workers of the cluster."
         )
     print_first_step("reading the vehicle", quiet=as_json)
     from ..clouds.folder import result_folder
@@ -127,7 +127,7 @@ def _lines(result: MountRanking) -> Iterator[str]:
 
 
 def _class_lines(result: MountRanking) -> Iterator[str]:
-    """Format the detection of each class by the best candidate as lines of text."""
+    """Format how well the best candidate detects each class as lines of text."""
     best = result.best
     targets = [t for t in result.study.placements.targets if best.detection[t.name] >= 0]
     width = max(5, *(len(target.name) for target in targets))

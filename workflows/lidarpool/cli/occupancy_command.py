@@ -1,4 +1,4 @@
-"""The `lidarpool occupancy` command, which writes occupancy grids of sweeps."""
+"""The `lidarpool occupancy` command, which writes occupancy grids for sweeps."""
 
 from __future__ import annotations
 
@@ -110,10 +110,10 @@ def occupancy(
     SCENARIO is a scenario or a campaign. The class and the instance of each voxel are determined
     from the surfaces of the scene at the start of the sweep, and the rays of the sensor determine
     which voxels are observed. The rays are simulated by this command, so the scenario does not have
-    to be run before.
+    to be run first.
 
-    The layout occ3d writes gts/SCENE/FRAME_TOKEN/labels.npz as Occ3D-nuScenes. The layout
-    semantickitti writes sequences/00/voxels/000000.bin, .label, .occluded and .invalid as
+    The layout occ3d writes gts/SCENE/FRAME_TOKEN/labels.npz as in Occ3D-nuScenes. The layout
+    semantickitti writes sequences/00/voxels/000000.bin, .label, .occluded and .invalid as in
     SemanticKITTI.
 
     \b
@@ -124,8 +124,8 @@ def occupancy(
     """  # noqa: D301 - Click requires the character \b
     if workers is not None and scheduler is not None:
         raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
-            "the cluster."
+            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
+            "workers of the cluster."
         )
     print_first_step("reading the scene", quiet=quiet or as_json)
     from lidarsim.simulator.occupancy import VoxelGrid

@@ -38,7 +38,7 @@ def prepared_with_notes(
 
 
 def relative_file(file: Path, folder: Path) -> str:
-    """Return the name of a file as it is written in a scenario in a folder."""
+    """Return the path of a file relative to the folder of a scenario."""
     return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
 
@@ -54,7 +54,7 @@ def scene_sections(scenario: Scenario, folder: Path) -> dict[str, Any]:
 
 
 def sensor_entry(model: str, folder: Path) -> str:
-    """Return a sensor model as it is written in a scenario in a folder."""
+    """Return a sensor model, or the path of its file relative to the folder of a scenario."""
     is_file = model.endswith((".yaml", ".yml"))
     return relative_file(Path(model), folder) if is_file else model
 

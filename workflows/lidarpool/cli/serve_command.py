@@ -1,4 +1,4 @@
-"""The `lidarpool serve` command, which answers the requests of simulators for sweeps."""
+"""The `lidarpool serve` command, which answers sweep requests from simulators."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _require_grpc() -> None:
 )
 @options.flag(
     "--ignore-unknown-objects",
-    help="Ignore moving objects that the scene does not have (default: refuse the request).",
+    help="Ignore moving objects that are not in the scene (default: refuse the request).",
 )
 @options.backend
 @options.new_file("--proto", help="Write the protocol to FILE (.proto) and exit.")

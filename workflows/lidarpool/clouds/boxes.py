@@ -24,8 +24,8 @@ class BoxVisibility:
     If several sweeps are stored, arrays have a leading axis for the sweep.
     """
 
-    # (a,): fraction of the rays which would hit the actor in an empty scene that hit it first; NaN
-    # if no ray would hit it.
+    # (a,): number of rays that hit the actor first, divided by the number of rays that would hit it
+    # in an empty scene; NaN if no ray would hit it.
     visible_fraction: Floats32
     truncation: Floats32  # (a,): fraction of the box outside the field of view or range
     # (a,): distance in meters between the box and the nearest ray; 0 if a ray would hit the actor.
@@ -202,10 +202,10 @@ def summarize_boxes(boxes: Sequence[Boxes]) -> dict[str, int | float]:
     Returns
     -------
     dict
-        The number of boxes, and of those with points; the mean visible fraction of boxes that a ray
-        would hit in an empty scene; the mean truncation; and the mean distance from the nearest ray
-        of boxes without points, in meters. A mean of nothing is omitted. The dictionary is empty if
-        the visibility was not determined.
+        The number of boxes and the number of boxes with points; the mean visible fraction of the
+        boxes that a ray would hit in an empty scene; the mean truncation; and the mean distance in
+        meters between the boxes without points and their nearest rays. Means without values are
+        omitted. The dictionary is empty if the visibility was not determined.
     """
     found = [(box, box.visibility) for box in boxes if box.visibility is not None]
     if not found:
@@ -228,5 +228,5 @@ def summarize_boxes(boxes: Sequence[Boxes]) -> dict[str, int | float]:
 
 
 def json_number(value: float) -> float | None:
-    """Return a number with six digits, or None for NaN, which JSON cannot represent."""
+    """Return a number with six significant digits, or None for NaN, which JSON cannot represent."""
     return None if math.isnan(value) else float(f"{value:.6g}")

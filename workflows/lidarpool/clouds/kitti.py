@@ -44,9 +44,10 @@ CALIBRATION_FILE = kitti_boxes.CALIBRATION_FILE
 CLASS_FILE = "semantic-kitti.yaml"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-# Upper limits of the truncation levels 0 and 1, which are those of easy and hard objects in the
-# detection benchmark, and of the hidden fraction for the occlusion levels 0 and 1.
+# Upper limits of the truncation levels 0 and 1, as for easy and hard objects in the detection
+# benchmark.
 _TRUNCATIONS = (0.15, 0.5)
+# Upper limits of the hidden fraction for the occlusion levels 0 and 1.
 _OCCLUSIONS = (0.2, 0.6)
 _UNKNOWN = 3
 _FILE_PATTERN = (
@@ -236,7 +237,7 @@ def kitti_intensity(points: Cloud) -> Floats32:
 
 
 def flow_arrays(points: Floats32, flow: Floats32, camera: Floats) -> dict[str, Floats32]:
-    """Return the scene flow of a sweep in the layout in which HPLFlowNet stores KITTI.
+    """Return the scene flow of a sweep in the layout that HPLFlowNet uses for KITTI.
 
     Row i of `pc1` is a point, and row i of `pc2` is the same point in the next sweep, each in the
     frame of its own sweep, whose axes point to the left, up and forward. Points whose flow is

@@ -2,7 +2,7 @@
 
 The files are stored next to the cloud and contain one row per sample, sorted by time. Bags are
 created from these files, so that all formats contain the same values. trajectory.csv contains the
-measured trajectory if the points are georeferenced by it.
+measured trajectory if it is used to georeference the points.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _IMU = (
 )
 _POSITION = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
-# Columns that `trajectory.file` of a scenario reads.
+# Columns that `trajectory.file` in a scenario can read.
 _TRAJECTORY = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _TRAJECTORY_HZ = 200.0  # poses per second without an IMU
 
@@ -106,7 +106,7 @@ def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
 
 
 def _trajectory_rate_hz(survey: Survey) -> float:
-    """Return the number of poses per second in the file of the measured trajectory."""
+    """Return the number of poses per second in the measured trajectory file."""
     imu = survey.navigation and survey.navigation.imu
     return imu.rate_hz if imu else _TRAJECTORY_HZ
 

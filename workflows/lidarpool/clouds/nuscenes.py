@@ -410,7 +410,7 @@ class _Tables:
         self.sweeps = sweeps
         self._entry = entry
         self.scene = _SCENE if entry is None else entry.name
-        # Rays are only counted by a run, but tokens are also required without one.
+        # Actor rays are only counted in a run, but tokens are also required without a run.
         planned = fingerprint(replace(sweeps, actor_rays=NO_ACTOR_RAYS))
         self._salt = f"{'' if entry is None else f'{entry.name} '}{planned}"
         self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}
@@ -555,7 +555,7 @@ def _visibility_rows() -> list[dict[str, Any]]:
 
 
 def _visibility(key_frames: Sequence[Boxes], actor: int) -> dict[str, float | None]:
-    """Return the visibility of an actor in a sample, in the lidar that sees it best.
+    """Return the visibility of an actor in a sample, for the lidar that sees it best.
 
     The dictionary is empty if the visibility was not determined. Its entries are not part of
     nuScenes.

@@ -9,7 +9,7 @@ column, with rows ordered by scan and ray, and these additional arrays:
 - `.samples`: end points of sample rays
 - `.triangles`: hit counters (see `Scene.counters`) that are not zero
 - `.hits`: number of hits of each of these counters
-- `.actor_rays`: how the rays of the scans meet actors, as bytes of records (`ACTOR_RAYS`)
+- `.actor_rays`: visibility records of actors in the scans (`ACTOR_RAYS`), as bytes
 
 `x`, `y` and `z` are integer multiples of the precision, relative to the scene's local origin, so
 coordinates are rounded only once.
@@ -195,7 +195,7 @@ def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 
 def read_actor_rays(storage: Storage, name: str) -> Records:
-    """Read how the rays of a part meet actors without reading its columns.
+    """Read the actor visibility records of a part without reading its columns.
 
     Returns records of type `ACTOR_RAYS`. Raises the same errors as `read_part`.
     """

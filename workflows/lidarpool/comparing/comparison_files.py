@@ -1,4 +1,4 @@
-"""Output folder of a comparison."""
+"""Write the output folder of a comparison."""
 
 from __future__ import annotations
 

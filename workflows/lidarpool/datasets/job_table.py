@@ -131,7 +131,7 @@ class JobRow:
         Raises ValueError if a field is missing, unknown or has the wrong type, or if the name or
         the split is not a plain file name.
         """
-        data = {"boxes": {}, **data}  # which rows of earlier versions lack
+        data = {"boxes": {}, **data}  # missing in rows from earlier versions
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
             raise ValueError(
                 f"a job row has a missing or unknown entry, such as {min(differing)!r}"
@@ -327,7 +327,7 @@ def _column_of(name: str) -> str:
 
 
 def _is_counted(name: str) -> bool:
-    """Return whether a column has the points of a class, or the visibility of boxes."""
+    """Return whether a column contains the points of a class or the visibility of boxes."""
     return bool(_CLASS.fullmatch(name)) or name in _BOXES
 
 

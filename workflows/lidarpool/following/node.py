@@ -27,7 +27,7 @@ _QUIET_S = 5.0  # time without a clock message after which a notice is shown
 _CHECK_NS = 50_000_000  # simulation time between checks of bodies and frames
 _NEVER_NS = 2**63 - 1  # later than any time
 _POLL_S = 0.05
-_MAX_READ_S = 0.1  # time for reading poses, after which all but the last of a topic are skipped
+_MAX_READ_S = 0.1  # time after which only the last message of each topic is read
 _MAX_DELAYS = 10_000  # delays that are kept for the summary
 
 

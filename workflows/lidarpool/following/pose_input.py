@@ -100,7 +100,7 @@ class PoseInput:
         self._jumped_s = time.monotonic()
 
     def set_clock(self, time_ns: int) -> None:
-        """Set the simulation time. Show a notice if it continues and poses were ignored."""
+        """Set the simulation time. If it continues and poses were ignored, show a notice."""
         self.clock_ns = time_ns
         if self._off_clock is None:
             return

@@ -1,1 +1,1 @@
-"""Evaluation of the mounting positions of lidars on a vehicle."""
+"""Evaluation of mounting positions of lidars on a vehicle."""

@@ -23,7 +23,7 @@ class CellGrid(NamedTuple):
 
 
 class BeamSegments(NamedTuple):
-    """Parts of beams in which they can detect an object. All arrays have n rows."""
+    """Parts of beams within which an object can be detected. All arrays have n rows."""
 
     origins: Floats  # (n, 3), meters
     directions: Floats  # (n, 3), unit vectors
@@ -33,11 +33,11 @@ class BeamSegments(NamedTuple):
 
 @compiled()
 def lower_to_beams(grid, beams, max_height_m, lowest):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Lower the heights of all cells to the lowest beam that passes through their columns.
+    """Lower the height of each cell to that of the lowest beam above the cell.
 
-    `lowest` (rows, columns) is the height above z = 0 from which on an object in the cell meets a
-    beam. It is reduced where a beam passes lower, but not below z = 0. Beams above `max_height_m`
-    do not count.
+    `lowest` (rows, columns) is the minimum height above z = 0 of an object in the cell that a beam
+    hits. It is reduced where a beam passes lower, but not below z = 0. Beams above `max_height_m`
+    are ignored.
     """
     width = grid.columns * grid.cell_m
     depth = grid.rows * grid.cell_m
@@ -70,7 +70,7 @@ def lower_to_beams(grid, beams, max_height_m, lowest):  # noqa: C901, PLR0914, P
             stop = min(stop, last)
         if not start < stop:
             continue
-        # Walk from cell to cell (Amanatides and Woo 1987).
+        # Traverse the cells (Amanatides and Woo 1987).
         column = min(max(int((x + start * dx) / grid.cell_m), 0), grid.columns - 1)
         row = min(max(int((y + start * dy) / grid.cell_m), 0), grid.rows - 1)
         step_x = 1 if dx > 0 else -1

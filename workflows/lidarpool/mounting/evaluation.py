@@ -1,8 +1,8 @@
 """Evaluation of a sensor at a mounting position.
 
 A sensor is evaluated independently of the other sensors of the vehicle, because sensors do not
-occlude each other. Points on targets are those of simulated sweeps, and the blind area results from
-the same beams.
+occlude each other. Points on targets come from simulated sweeps, and the blind area is computed
+from the same beams.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ VEHICLE = "vehicle"
 GROUND = "ground"
 # Rays start outside the vehicle, even if the sensor is mounted on its surface.
 CONTACT_M = 1e-3
-_ABOVE_GROUND_M = 1e-3  # heights below are only reached by a return from the ground
+_ABOVE_GROUND_M = 1e-3  # lower heights require a return from the ground
 _PARKED_M = -1000.0  # height of unused targets
 _GROUND_MARGIN_M = 10.0
 _BISECTIONS = 60
@@ -40,7 +40,7 @@ _FARTHEST_M = 1e5
 
 
 class BlindMap(NamedTuple):
-    """Heights from which on an object in each cell of a map is visible to a sensor.
+    """Minimum height of an object that is visible to a sensor, for each cell of a map.
 
     The arrays have shape (rows, columns), with the lowest y first. Cells that no beam reaches are
     infinite, and cells whose ground returns light are 0.
@@ -64,9 +64,9 @@ class MountResult(NamedTuple):
     blocked
         Number of beams that the vehicle blocks.
     blocked_near
-        Number of these beams that it blocks within the minimum range of the sensor.
+        Number of beams that the vehicle blocks within the minimum range of the sensor.
     blocked_share
-        Share of the blocked beams by azimuth and elevation in the sensor frame, in cells of
+        Share of beams that are blocked, by azimuth and elevation in the sensor frame, in cells of
         `SHARE_DEG`. Cells without beams are NaN. Shape (rows, columns).
     """
 
@@ -83,22 +83,22 @@ SHARE_DEG = 2.0  # size of the cells of `MountResult.blocked_share`
 
 @dataclass(frozen=True, eq=False)
 class MountEvaluator:
-    """Evaluator of sensors on a vehicle, which is on level ground.
+    """Evaluator of sensors on a vehicle on level ground.
 
     Attributes
     ----------
     body
-        Mesh of the vehicle in its own frame, which stands on z = 0.
+        Mesh of the vehicle in its own frame, with the ground at z = 0.
     placements
         Targets to detect.
     grid
         Cells of the blind-area map.
     max_height_m
-        Largest height of the map.
+        Maximum height of the map in meters.
     reflectance
         Reflectance of the ground, and of the objects on the map.
     returns
-        Settings of returns for sensors without values of their data sheet.
+        Settings of returns for sensors without data sheet values.
     conditions
         Further arguments of `Scanner`: noise and weather.
     """
@@ -229,7 +229,7 @@ class MountEvaluator:
         return columns[on_map], rows[on_map]
 
     def _range_m(self, scanner: Scanner) -> float:
-        """Return the distance up to which the sensor detects an object on the map.
+        """Return the maximum distance in meters at which the sensor detects an object on the map.
 
         At this distance, half of the pulses that hit a surface with `reflectance` at normal
         incidence return.
@@ -249,14 +249,14 @@ class MountEvaluator:
 
 
 class _Slots(NamedTuple):
-    """Instances of the targets' meshes, which sweeps use one after the other."""
+    """Instances of the targets' meshes, which are reused in each sweep."""
 
     names: list[str]
     first: Ints  # (m,), index of the first slot of each mesh
 
     @classmethod
     def for_sweeps(cls, placements: Placements, sweeps: Sequence[Ints]) -> _Slots:
-        """Return as many slots of each mesh as a sweep needs."""
+        """Return as many slots for each mesh as any sweep requires."""
         count = len(placements.meshes)
         most = np.max(
             [np.bincount(placements.mesh[sweep], minlength=count) for sweep in sweeps], axis=0
@@ -269,7 +269,7 @@ class _Slots(NamedTuple):
         return cls(names, np.cumsum(most) - most)
 
     def instances(self, placements: Placements) -> list[SceneInstance]:
-        """Return an instance for each slot, which is not in use yet."""
+        """Return an unused instance for each slot."""
         owners = np.searchsorted(self.first, np.arange(len(self.names)), "right") - 1
         return [
             SceneInstance(placements.meshes[mesh], _parked(), name)
@@ -277,7 +277,7 @@ class _Slots(NamedTuple):
         ]
 
     def of_sweep(self, meshes: Ints) -> Ints:
-        """Return different slots for placements with the given meshes. Shape (k,)."""
+        """Return distinct slots for placements with the given meshes. Shape (k,)."""
         taken = self.first.copy()
         slots = np.empty(len(meshes), np.int64)
         for row, mesh in enumerate(meshes.tolist()):
@@ -297,7 +297,7 @@ def _parked() -> Floats:
 
 
 def _with_contact(mounted: Mounted) -> Mounted:
-    """Return a sensor that the vehicle also blocks within the minimum range of the sensor.
+    """Reduce the minimum range of a sensor, so that the vehicle also blocks beams within it.
 
     The simulation ignores surfaces that are closer than the minimum range.
     """

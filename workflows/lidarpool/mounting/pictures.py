@@ -36,18 +36,18 @@ _LABEL_SIDES = (
     (3, -3, "left", "top"),
     (-3, -3, "right", "top"),
 )
-MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
+MAX_PANELS = 6  # maximum number of candidates or target classes on a page
 _SIZE = (1600, 1200)
 # Layout of pages with several charts, pixels.
 _LEFT = 80
 _TOP = 190
 _GAP = 110  # between rows of charts
 _PANELS_WIDTH = 1340
-# Colors from "visible on the ground" to "an object of the largest height is hidden".
+# Colors from "ground visible" to "blind to objects of the maximum height".
 _BANDS = ("#eef3f7", "#d8daeb", "#b2abd2", "#8073ac", "#542788", "#46207a", "#381868", "#2d004b",
           "#1c0030")  # fmt: skip
 _VEHICLE = "#7d8794"
-_COUNTS = ("#e08214", "#d1e5f0", "#67a9cf", "#2166ac")  # cells seen by 0, 1, 2, and more sensors
+_COUNTS = ("#e08214", "#d1e5f0", "#67a9cf", "#2166ac")  # cells seen by 0, 1, 2, and 3 or more
 _FRONT = "#d6336c"
 _OTHER = "#5b8fd0"
 
@@ -121,7 +121,7 @@ def draw_comparison(result: MountRanking) -> Page:
     page.legend([*zip(_band_names(result.study), colors, strict=True)], "sensor")
     page.title(
         "Blind areas of the candidates",
-        "in the order of their ranks; vertical: x, m; forward is up",
+        "in order of rank; vertical: x, m; forward is up",
     )
     return page
 
@@ -147,7 +147,7 @@ def draw_redundancy(result: MountRanking) -> Page:
 
 
 def draw_points(result: MountRanking) -> Page:
-    """Draw the points on each class of targets by distance and bearing, for the best candidate."""
+    """Plot the points on targets by distance and bearing for each class, for the best candidate."""
     placements = result.study.placements
     rows = [k for k in range(len(placements.targets)) if (placements.target == k).any()]
     rows = rows[:MAX_PANELS]
@@ -175,7 +175,7 @@ def draw_points(result: MountRanking) -> Page:
 
 
 def draw_detection(result: MountRanking) -> Page:
-    """Draw the detection probability of the best candidate by distance, and the trade-off."""
+    """Plot the detection probability of the best candidate by distance, and the trade-off."""
     page = Page((1600, 760))
     axes = page.chart(
         (0.06, 0.13, 0.36, 0.62), xlabel="distance, m", ylabel="share with enough points",
@@ -207,7 +207,7 @@ def draw_detection(result: MountRanking) -> Page:
 
 
 def _draw_tradeoff(page: Page, result: MountRanking) -> None:
-    """Draw all candidates by detection rate and blind area."""
+    """Plot all candidates by detection rate and blind area."""
     height = result.study.rules.ranked_height_m
     axes = page.chart(
         (0.645, 0.13, 0.335, 0.62), xlabel=f"blind area at {height:g} m, m²",
@@ -230,10 +230,10 @@ def _draw_tradeoff(page: Page, result: MountRanking) -> None:
 def _label_points(
     page: Page, axes: Axes, points: Floats, names: Mapping[int, str], required: Set[int]
 ) -> None:
-    """Label points at the first side without other labels and points.
+    """Label each point on the first side that is free of other labels and points.
 
-    Points of shape (n, 2) are labeled if they have a name. Labels in `required` may cover other
-    points, and other labels are omitted if no side is free.
+    `points` has shape (n, 2). Points are labeled if they have a name. Labels in `required` may
+    cover points. Other labels are omitted if no side is free.
     """
     halo = [withStroke(linewidth=2 * page.unit, foreground=theme.GROUND)]
     canvas = FigureCanvasAgg(page.figure)
@@ -385,7 +385,7 @@ def _draw_polar(
     target: int,
     norm: LogNorm,
 ) -> None:
-    """Draw the points on a class of targets in a polar chart."""
+    """Plot the points on a class of targets in a polar chart."""
     placements = result.study.placements
     axes.set_theta_zero_location("N")
     axes.set_facecolor(theme.GROUND)

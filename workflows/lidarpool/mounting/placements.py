@@ -1,4 +1,4 @@
-"""Targets around a vehicle, and how many of them a single sweep can contain."""
+"""Targets around a vehicle, and their distribution among sweeps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarsim.sensor import Sensor
 
 AZIMUTH_BINS = 1440  # azimuth bins of a sweep, 0.25° each
 _DILATION = 40  # bins by which the field of view is widened, since beams may start off center
-_MARGIN_RAD = 0.004  # angle between two targets in a sweep
+_MARGIN_RAD = 0.004  # minimum angle between two targets in a sweep
 _NEAR_M = 0.2  # a target that is closer to a sensor is simulated alone
 
 
@@ -27,7 +27,7 @@ class Target(NamedTuple):
     name
         Name of the class.
     points
-        Number of points from which on a target counts as detected.
+        Minimum number of points on a detected target.
     reflectance
         Reflectance of the targets.
     weight
@@ -82,7 +82,7 @@ class Placements:
 
     @property
     def bearings_deg(self) -> Floats:
-        """Bearing of each placement, counterclockwise from straight ahead. Shape (p,)."""
+        """Bearing of each placement, counterclockwise from the x axis. Shape (p,)."""
         return np.degrees(np.arctan2(self.positions[:, 1], self.positions[:, 0]))
 
     def matrices(self) -> Floats:
@@ -122,16 +122,16 @@ class Placements:
         )
 
     def without_collisions(self, body: Floats) -> Placements:
-        """Return the placements whose footprint is outside a horizontal rectangle.
+        """Return the placements whose footprints do not overlap an axis-aligned rectangle.
 
-        `body` has the lower and the upper corner of the rectangle. Shape (2, 2).
+        `body` contains the lower and the upper corner of the rectangle. Shape (2, 2).
         """
         corners = self.footprints()
         rectangle = np.array(
             [[body[i, 0], body[j, 1]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
         )
         apart = np.zeros(len(self), np.bool_)
-        # Two convex shapes are apart if the normal of one of their sides separates them.
+        # Two convex shapes are disjoint if the normal of one of their sides separates them.
         for axis in (0, 1):
             apart |= corners[..., axis].max(axis=1) < body[0, axis]
             apart |= corners[..., axis].min(axis=1) > body[1, axis]
@@ -153,7 +153,7 @@ def grid_placements(
 ) -> Placements:
     """Return all targets on a polar grid around the vehicle, in all headings.
 
-    `meshes` has the mesh of each target.
+    `meshes` contains the mesh of each target.
     """
     kinds = np.arange(len(targets))
     bearing = 2 * np.pi * np.arange(bearings) / bearings
@@ -184,8 +184,8 @@ def pack_sweeps(
 ) -> Iterator[Ints]:
     """Distribute placements among sweeps in which no target can hide another.
 
-    Seen from the sensor, the azimuths of the targets in a sweep do not overlap. As a straight ray
-    has a constant azimuth, it meets at most one of them.
+    Seen from the sensor, the azimuths of the targets in a sweep do not overlap. Because the azimuth
+    of a straight ray is constant, a ray hits at most one of them.
 
     Parameters
     ----------
@@ -194,9 +194,9 @@ def pack_sweeps(
     origin
         Position of the sensor in the vehicle frame, in meters. Shape (3,).
     sensor
-        The sensor, whose beams may start beside its origin.
+        The sensor. Its beams may start at an offset from its origin.
     in_view
-        Whether a beam of the sensor has an azimuth in each bin. See `azimuths_in_view`.
+        Whether each azimuth bin contains a beam of the sensor. See `azimuths_in_view`.
 
     Yields
     ------
@@ -229,7 +229,7 @@ def _beam_offset_m(sensor: Sensor) -> float:
 
 
 def _azimuth_masks(corners: Floats, offset_m: float) -> tuple[list[int], Ints]:
-    """Return the azimuth bins of footprints as bit masks, and the number of bins.
+    """Return the azimuth bins of each footprint as a bit mask, and the number of bins.
 
     `corners` (p, 4, 2) are relative to the sensor.
     """
@@ -253,7 +253,7 @@ def _azimuth_masks(corners: Floats, offset_m: float) -> tuple[list[int], Ints]:
 
 
 def _distance_to_origin(corners: Floats) -> Floats:
-    """Return the distance from the origin to each quadrilateral, or 0 if it is inside."""
+    """Return the distance from the origin to each quadrilateral, or 0 if the origin is inside."""
     following = np.roll(corners, -1, axis=1)
     way = following - corners
     share = -(corners * way).sum(axis=2) / np.maximum((way * way).sum(axis=2), 1e-30)

@@ -1,4 +1,4 @@
-"""Metrics of candidates, which combine the sensors of a vehicle at one mount each."""
+"""Metrics of candidates, which combine the sensors of a vehicle, each at one mount."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from .evaluation import BlindMap, MountResult
 from .placements import Placements
 
-_REACHED_M = 1.5e-3  # beams that reach the ground have this height at most
+_REACHED_M = 1.5e-3  # maximum height of beams that reach the ground
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,16 @@ class MountCandidate:
 
 
 class RankingRules(NamedTuple):
-    """What a score depends on.
+    """Parameters of the score.
 
     Attributes
     ----------
     heights_m
         Heights of the blind-area map, in meters.
     ranked_height_m
-        Height whose blind area counts.
+        Height for which the blind area is part of the score, in meters.
     blind_weight
-        Weight of the blind share.
+        Weight of the blind share of the map.
     outside
         Cells that are outside the vehicle. Shape (rows, columns).
     cell_m2
@@ -75,7 +75,8 @@ class CandidateResult:
     points
         Number of points of all sensors on each placement. Shape (p,).
     lowest_m
-        Height from which on an object in each cell is visible to a sensor. Shape (rows, columns).
+        Minimum height of an object that is visible to a sensor, for each cell. Shape (rows,
+        columns).
     detection
         Share of the placements of each class that have enough points, by class.
     mean_points
@@ -89,7 +90,7 @@ class CandidateResult:
     hidden_m2
         Part of `blind_m2` that would be visible without the vehicle.
     twice_m2
-        Area that at least two sensors see, for each height.
+        Area that at least two sensors see for each height, in square meters.
     map_m2
         Area of the map outside the vehicle.
     score
@@ -112,7 +113,7 @@ class CandidateResult:
 
     @property
     def order(self) -> tuple[float, ...]:
-        """Sort key, by which the best candidate comes first."""
+        """Sort key that places the best candidate first."""
         return (-self.score, sum(self.blind_m2.values()), -sum(self.mean_points.values()))
 
 
@@ -126,7 +127,7 @@ class _Areas(NamedTuple):
 
     @classmethod
     def from_maps(cls, maps: Sequence[BlindMap], rules: RankingRules) -> _Areas:
-        """Measure the areas that the sensors with the given maps see together."""
+        """Compute the areas for sensors with the given maps."""
         lowest = np.stack([one.lowest_m for one in maps])
         combined = lowest.min(axis=0)
         unobstructed = np.stack([one.unobstructed_m for one in maps]).min(axis=0)

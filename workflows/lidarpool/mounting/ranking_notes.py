@@ -28,7 +28,7 @@ def ranking_notes(
     placements: Placements,
     body: SceneMesh,
 ) -> list[str]:
-    """Return notes about ranked candidates, of which the first is the best."""
+    """Return notes about candidates that are sorted by rank, best first."""
     notes = [*_body_notes(ranked, vehicle, body), *_best_notes(ranked[0])]
     notes += _range_notes(vehicle)
     if vehicle.rank.height_m is None and vehicle.ranked_height_m != DEFAULT_HEIGHT_M:
@@ -79,7 +79,7 @@ def _body_notes(
 
 
 def _mount_names(poses: Sequence[Pose], mounts: dict[str, Pose]) -> str:
-    """Describe mounts of a sensor by their names, or by their number in a search."""
+    """Describe mounts of a sensor by their names or, in a search, by their count."""
     if not mounts:
         return f"{plural(len(poses), 'mount')} of the search"
     names = [key for key, pose in mounts.items() if pose in poses]
@@ -119,7 +119,7 @@ def _best_notes(best: CandidateResult) -> Iterator[str]:
 
 
 def _range_notes(vehicle: VehicleFile) -> Iterator[str]:
-    """Yield a note about the sensors without a detection range, which limits their ranges."""
+    """Yield a note about the sensors without a detection range, which would limit their range."""
     without = [name for name in vehicle.sensors if not _has_range_limit(vehicle, name)]
     if not without:
         return

@@ -1,8 +1,8 @@
 """Enumeration and search of candidates.
 
-Given mounts are combined completely. Mounts in ranges are searched: the sensors are placed one
-after the other, each at the best of several random mounts, and then moved in small steps as long as
-the score increases.
+For given mounts, all combinations are evaluated. Mounts in ranges are searched. The sensors are
+placed one after another, each at the best of several random mounts, and then moved in small steps
+as long as the score increases.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .ranking import CandidateResult, MountCandidate, RankingRules, evaluate_can
 
 EvaluateMounts = Callable[[Sequence[tuple[str, Pose]]], Iterable[MountResult]]
 
-_DECIMALS = (3, 3, 3, 1, 1, 1)  # digits of x, y, z, yaw, pitch and roll
+_DECIMALS = (3, 3, 3, 1, 1, 1)  # decimal places of x, y, z, yaw, pitch and roll
 _FIRST_STEP = 0.25  # first step of a refinement, as a share of a range
 _MAX_MOVES = 4  # moves of a sensor in a refinement
 
@@ -57,7 +57,7 @@ class CandidateSearch:
     vehicle
         The vehicle file.
     placements, rules
-        Targets, and rules of the score.
+        Targets, and parameters of the score.
     evaluate
         Function that evaluates several sensors at given mounts, in the order of its argument.
     """
@@ -111,12 +111,12 @@ class CandidateSearch:
     def _best(
         self, chosen: Mapping[str, Pose], name: str, poses: Sequence[Pose]
     ) -> CandidateResult:
-        """Return the best candidate with one of several mounts of a sensor."""
+        """Return the best candidate among several mounts of a sensor."""
         candidates = [MountCandidate("", {**chosen, name: pose}) for pose in poses]
         return min(self._score(candidates), key=lambda result: result.order)
 
     def _random_mounts(self, name: str, ranges: MountRanges) -> list[Pose]:
-        """Return the center of the ranges, and random mounts."""
+        """Return the center of the ranges, followed by random mounts."""
         search = self.vehicle.search
         rng = np.random.default_rng([named_seed(search.seed, name)])
         limits = np.array(ranges.limits)

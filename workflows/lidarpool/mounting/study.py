@@ -81,7 +81,7 @@ class MountStudy:
     evaluator
         Evaluator of sensors at a mount.
     rules
-        Rules of the score.
+        Parameters of the score.
     notes
         Notes about the files.
     """
@@ -105,8 +105,8 @@ class MountStudy:
         body = _body(vehicle.body, loader)
         if float(body.bounds[0, 2]) < -0.5:
             findings.notes.append(
-                f"the body extends to {body.bounds[0, 2]:.2f} m below the ground, which is z = 0 "
-                "in the frame of the vehicle"
+                f"the body extends to z = {body.bounds[0, 2]:.2f} m, but the ground is z = 0 in "
+                "the frame of the vehicle"
             )
         everywhere = _placements(vehicle, loader)
         placements = everywhere.without_collisions(body.bounds[:, :2])
@@ -191,7 +191,7 @@ class MountStudy:
 
     @property
     def _batch(self) -> int:
-        """Largest number of mounts that are evaluated together."""
+        """Maximum number of mounts that are evaluated together."""
         if not self.vehicle.is_search:
             return sum(len(sensor.mounts) for sensor in self.vehicle.sensors.values())
         return self.vehicle.search.samples
@@ -265,7 +265,7 @@ def _grid(vehicle: VehicleFile, body: SceneMesh) -> CellGrid:
 
 
 def _outside(body: SceneMesh, grid: CellGrid) -> Bools:
-    """Return the cells whose centers are not below the vehicle. Shape (rows, columns)."""
+    """Return whether the center of each cell is not below the vehicle. Shape (rows, columns)."""
     x = grid.x + (np.arange(grid.columns) + 0.5) * grid.cell_m
     y = grid.y + (np.arange(grid.rows) + 0.5) * grid.cell_m
     centers = np.stack([*np.meshgrid(x, y), np.full((grid.rows, grid.columns), -100.0)], axis=-1)

@@ -1,4 +1,4 @@
-"""Classes of Occ3D-nuScenes, and the names of other data sets that correspond to them."""
+"""Classes of Occ3D-nuScenes, and the corresponding names in other data sets."""
 
 from __future__ import annotations
 

@@ -22,11 +22,11 @@ from ..clouds.nuscenes import sample_tokens
 from .class_names import OCC3D_CLASSES, occ3d_class
 
 FREE_OCC3D = 17
-OTHER_OBJECT = 99  # class of SemanticKITTI that evaluations ignore
+OTHER_OBJECT = 99  # SemanticKITTI class that evaluations ignore
 
 
 class GridLayout(ABC):
-    """Names and content of the files of a job.
+    """Names and content of the files for a job.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class SemanticKitti(GridLayout):
     - `.invalid`: bits of the voxels that no ray of the sweep or of the following sweeps observes.
     - `.instance`: object number + 1 of each voxel (uint16), or 0. It is not part of SemanticKITTI.
 
-    Voxels are sorted by x, y and z, and z changes fastest. The first voxel of a byte has the most
+    Voxels are sorted by x, y and z, and z changes fastest. The first voxel in a byte is the most
     significant bit.
 
     Behley et al., SemanticKITTI, 2019.

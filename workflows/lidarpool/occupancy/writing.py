@@ -199,7 +199,7 @@ def write_occupancy(
     settings
         Layout, grid and sensor.
     job
-        Number of the only job of the campaign to write, or None for all jobs.
+        Number of the campaign job to write, or None for all jobs.
     client
         Client of a cluster whose OTHER workers can read the scenario at the same path. By default,
         processes on this machine compute the grids.
@@ -208,7 +208,7 @@ def write_occupancy(
     overwrite
         Whether to replace existing files.
     progress
-        Function that is called with the numbers of finished and of all sweeps.
+        Function that is called with the number of finished sweeps and the number of all sweeps.
 
     Raises
     ------

@@ -50,8 +50,8 @@ class NeighborSearch:
 
         Returns
         -------
-        The indices of the reference points, of shape (n, max_count) and negative beyond the number
-        of neighbors, and the numbers of neighbors, of shape (n,).
+        The indices of the reference points, of shape (n, max_count) and padded with negative
+        values, and the numbers of neighbors, of shape (n,).
         """
         index, _, counts = self._tree.hybrid_search(self._tensor(points), self._radius, max_count)
         return index.numpy(), counts.numpy()

@@ -24,8 +24,8 @@ from .flight_scanner import AirborneScanner
 
 SPEEDS_M_S = (3.0, 70.0)  # default limits of the speed over ground
 _QUANTILES = (0.05, 0.95)  # of the height above ground, for the spacing and for the speed
-_CLOSE = 0.1  # lines that are closer than this share of the swath are noted
-_EVEN = 2.0  # largest ratio of the distances along and across the track that is not noted
+_CLOSE = 0.1  # a note is shown if lines are closer than this share of the swath
+_EVEN = 2.0  # maximum ratio of the distances along and across the track without a note
 
 
 class Rates(NamedTuple):
@@ -50,7 +50,7 @@ class FlightPlan:
     Heights and positions are in world coordinates, in meters.
     """
 
-    area: Any  # polygon of shapely
+    area: Any  # Shapely polygon
     scanner: AirborneScanner
     lines: tuple[FlightLine, ...]
     path: FlightPath
@@ -63,7 +63,8 @@ class FlightPlan:
     densities_m2: tuple[float, float]  # densities of a strip over the lowest and highest ground
     missing: float  # share of the samples without ground
     reach_m: float  # distance by which the strips extend beyond the area
-    # Height above ground at which no ground is closer than the minimum range, or None if this is so
+    # Height above ground at which no ground is closer than the minimum range, or None if the
+    # planned height is sufficient
     required_agl_m: int | None = None
     notes: tuple[str, ...] = ()  # requirements that are not met, and how to meet them
 
@@ -78,14 +79,14 @@ class FlightPlan:
 
     @property
     def counts(self) -> str:
-        """Numbers of flight lines and cross strips in words."""
+        """Text with the numbers of flight lines and cross strips."""
         lines = plural(self.count("line"), "flight line")
         cross = self.count("cross")
         return f"{lines} and {plural(cross, 'cross strip')}" if cross else lines
 
     @property
     def farthest_m(self) -> float:
-        """Maximum distance of the ground from the scanner, at the edges of the swath."""
+        """Maximum distance between the scanner and the ground, at the edges of the swath."""
         return self.highest_m / math.cos(math.radians(self.scanner.half_fov_deg))
 
     @property
@@ -142,13 +143,13 @@ def plan_flight(
     """Plan the flight lines that cover an area.
 
     The lines are parallel to the longest side of the area. Adjacent strips have at least the
-    overlap, within 1 % of the swath, at the 5 % quantile of the heights above ground, and strips
-    have the density at the 95 % quantile.
+    requested overlap, with a tolerance of 1 % of the swath, at the 5 % quantile of the heights
+    above ground. Strips have the requested density at the 95 % quantile.
 
     Parameters
     ----------
     area
-        Polygon or multipolygon of shapely, in world coordinates in meters.
+        Shapely polygon or multipolygon in world coordinates, in meters.
     terrain
         Ground of the survey.
     scanner

@@ -22,7 +22,7 @@ _CRS84 = re.compile(r"CRS84$", re.IGNORECASE)
 
 
 class Area(NamedTuple):
-    """Area of a survey, as polygons of shapely."""
+    """Area of a survey, as Shapely polygons."""
 
     shape: Any  # Polygon or MultiPolygon
     epsg: int | None  # EPSG code of the coordinates, 4326 for longitudes and latitudes
@@ -39,7 +39,7 @@ def read_area(text: str) -> Area | None:
 
     Returns
     -------
-    The area, or None if the text describes neither of these, such as the path of a mesh.
+    The area, or None if the text is none of these, for example the path of a mesh.
 
     Raises
     ------
@@ -92,14 +92,14 @@ def _shape_from_wkt(text: str) -> Any:
 
 
 def _check_shape(shape: Any, text: str) -> None:
-    """Raise LidarError unless a geometry is a valid polygon with an area."""
+    """Raise LidarError unless a geometry is a valid polygon with a positive area."""
     if not shape.is_valid:
         reason = import_module("shapely").is_valid_reason(shape)
         raise LidarError(f"The area {_shorten(text)} is not a valid polygon: {reason}.")
     if shape.geom_type not in ("Polygon", "MultiPolygon") or not shape.area > 0:
         raise LidarError(
-            f"The area {_shorten(text)} must be a polygon, but is {shape.geom_type} with an area "
-            f"of {shape.area:g}. Draw the outline of the survey as a polygon."
+            f"The area {_shorten(text)} must be a polygon, but its type is {shape.geom_type} and "
+            f"its area is {shape.area:g}. Draw the outline of the survey as a polygon."
         )
 
 
@@ -149,7 +149,7 @@ def utm_epsg(shape: Any) -> int:
 
 
 def transform_shape(shape: Any, source: int, target: int) -> Any:
-    """Transform a geometry of shapely between two coordinate systems.
+    """Transform a Shapely geometry between two coordinate systems.
 
     `source` and `target` are EPSG codes.
 

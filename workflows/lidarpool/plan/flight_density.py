@@ -1,4 +1,4 @@
-"""Density of points in the area of an airborne survey, expected and simulated."""
+"""Expected and simulated point density in the area of an airborne survey."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ class DensityMap(NamedTuple):
 
     @classmethod
     def from_squares(cls, squares: Squares, area: Sequence[Ring], least_m: float) -> DensityMap:
-        """Combine squares whose centers are in an area to cells of at least `least_m` meters.
+        """Combine squares whose centers are in an area into cells of at least `least_m` meters.
 
-        The southwest corner of the cells is that of the bounding box of the area.
+        The southwest corner of the grid is that of the bounding box of the area.
         """
         squares = squares.over(area)
         lower, upper = _bounds(area)
@@ -92,14 +92,14 @@ class DensityMap(NamedTuple):
 
 
 class AreaDensity(NamedTuple):
-    """Density of points in the planned area, in points per square meter."""
+    """Point density in the planned area, in points per square meter."""
 
     planned_m2: float
     mean_m2: float
     low_m2: float  # density that 95 % of the area exceeds
     reached: float  # share of the area with at least the planned density
     empty: float  # share of the area without points
-    cell_m: float  # side of the cells to which the last three values refer
+    cell_m: float  # side of the cells from which the previous three values are computed
 
 
 def summarize_density(found: DensityMap, planned_m2: float) -> AreaDensity:
@@ -226,7 +226,7 @@ def _count_in_area(points: Floats, weight: float, area: Sequence[Ring]) -> Densi
 
 
 def cell_side_m(density_m2: float, area: Sequence[Ring]) -> float:
-    """Return the side in meters of cells that contain enough points, at most that of the area."""
+    """Return the side in meters of cells with enough points, at most the side of the area."""
     longest_m = longest_side_m(area)
     if density_m2 * longest_m**2 <= CELL_POINTS:
         return longest_m

@@ -20,7 +20,7 @@ _PATH_POINTS = 2000  # maximum number of points of the path in a file
 
 
 class _Feature(NamedTuple):
-    """A feature on a map, with a geometry of shapely."""
+    """A feature on a map, with a Shapely geometry."""
 
     name: str
     kind: str
@@ -31,8 +31,8 @@ class _Feature(NamedTuple):
 def _features(plan: FlightPlan, epsg: int | None, origin: Floats) -> Iterator[_Feature]:
     """Yield the area, the lines and the path of a plan.
 
-    The coordinates are longitudes and latitudes if `epsg` is the code of the coordinates of the
-    plan plus `origin`. Otherwise, they are those of the plan.
+    If `epsg` is not None, it is the EPSG code of the plan coordinates plus `origin`, and the
+    features have longitudes and latitudes. Otherwise, they have the coordinates of the plan.
     """
     from shapely import LineString
     from shapely.affinity import translate

@@ -23,12 +23,12 @@ _Track = tuple[Floats, Floats]  # start and stop, with shape (2,)
 
 _ACROSS = 9  # number of ground samples across the swath
 _ALONG = 400  # maximum number of ground samples along a line
-_NEGLIGIBLE = 0.01  # share of the swath by which the coverage and the overlap may be too small
+_NEGLIGIBLE = 0.01  # tolerance of the coverage and the overlap, as a share of the swath
 _MARGIN_M = 2.0  # distance by which a line extends beyond the area
 
 
 class Terrain:
-    """Ground of a survey, which is a scene or, without a scene, level at a height of 0."""
+    """Ground of a survey. Without a scene, it is level at a height of 0."""
 
     def __init__(self, scene: Scene | None = None) -> None:
         self._scene = None
@@ -104,7 +104,7 @@ def place_lines(
     Parameters
     ----------
     area
-        Polygon or multipolygon of shapely.
+        Shapely polygon or multipolygon.
     terrain, scanner, layout
         Ground, scanner and requirements.
     share
@@ -128,7 +128,7 @@ def _place_lines(
 ) -> Strips:
     """Place flight lines.
 
-    `narrow_m` is the height above ground at which the swath results in the requested overlap.
+    `narrow_m` is the height above ground at which strips have the requested overlap.
     """
     swath_m = scanner.swath_m(narrow_m)
     margin_m = _MARGIN_M + scanner.ahead * layout.agl_m
@@ -193,13 +193,13 @@ def _check_count(count: int) -> None:
 
 
 def longest_side(area: Any) -> float:
-    """Return the direction of the longest side of the smallest rectangle around an area.
+    """Return the direction of the longest side of an area's minimum rotated rectangle.
 
     The direction is in radians, counterclockwise from x, in (-π/2, π/2].
     """
     corners = np.array(area.minimum_rotated_rectangle.exterior.coords)[:4]
     sides = np.roll(corners, -1, axis=0) - corners
-    # Of equally long sides, the one that is closer to the x axis determines the direction.
+    # If sides have the same length, the one that is closer to the x axis is used.
     x, y = max(sides.tolist(), key=lambda side: (round(math.hypot(*side), 6), abs(side[0])))
     angle = math.atan2(y, x)
     return angle - math.pi * math.ceil(angle / math.pi - 0.5)

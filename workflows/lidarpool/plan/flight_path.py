@@ -1,4 +1,4 @@
-"""Paths of an aircraft along flight lines, with turns of constant bank between them."""
+"""Paths of an aircraft along flight lines, with turns at a constant bank angle between them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SAMPLE_S = 0.5  # interval between poses
 _GRAVITY_M_S2 = 9.80665
 _ROLL_SAMPLES = 5  # number of samples over which the aircraft rolls into a turn
 _MAX_POSES = 200_000
-# Signs of the curvature of the three parts of a shortest path (Dubins 1957).
+# Curvature signs of the three segments of a shortest path (Dubins 1957).
 _WORDS = {
     "LSL": (1, 0, 1),
     "RSR": (-1, 0, -1),
@@ -51,7 +51,7 @@ class FlightLeg(NamedTuple):
 class FlightPath(NamedTuple):
     """Timed poses of an aircraft, and the times at which it starts each flight line.
 
-    The aircraft flies at a constant speed over ground, is level in pitch, and banks in turns.
+    The aircraft flies at a constant speed over ground with zero pitch, and banks in turns.
     """
 
     times_s: Floats  # (k,)
@@ -160,7 +160,7 @@ def shortest_turn(
 
 
 def _dubins(a: float, b: float, d: float) -> dict[str, tuple[float, float, float]]:
-    """Return the lengths of the parts of candidate paths, for a turn radius of 1.
+    """Return the segment lengths of candidate paths for a turn radius of 1.
 
     The start is at the origin in the direction `a`, and the stop is at (d, 0) in the direction `b`.
     """
@@ -207,7 +207,7 @@ class _Plane(NamedTuple):
 
 
 def _follow(sections: Sequence[_Section], start: Floats, angle: float, along_m: Floats) -> _Plane:
-    """Return the states at distances `along_m` from the start of a path, in ascending order."""
+    """Return the states at distances `along_m` (ascending) from the start of a path."""
     positions = np.empty((len(along_m), 2))
     directions = np.empty(len(along_m))
     curvatures = np.zeros(len(along_m))

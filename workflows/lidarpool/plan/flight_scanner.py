@@ -112,7 +112,7 @@ class AirborneScanner:
 
 
 def _cycle_firings(sensor: Sensor) -> tuple[int, int]:
-    """Return the half-open range of firings in a cycle of a sensor."""
+    """Return the first firing in a cycle of a sensor, and one past the last."""
     steps = sensor.steps_of_revolution(0)
     return sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1]
 

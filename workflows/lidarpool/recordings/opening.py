@@ -34,7 +34,7 @@ _CONVERSIONS = {  # {ending of an unsupported format: advice}
     **dict.fromkeys(
         (".glb", ".gltf", ".obj", ".stl"),
         "It is a mesh. Run a survey of it first, "
-        "or compare a cloud with it with `lidarpool compare CLOUD MESH --survey mesh`.",
+        "or use `lidarpool compare CLOUD MESH --survey mesh` to compare a cloud with it.",
     ),
 }
 # Extensions of files for which the user can set the unit.

@@ -329,7 +329,7 @@ class SurveyOutput:
 
 
 def _sweeps_of(result: RunResult) -> Sweeps:
-    """Return the sweeps of a result, including what the run determined for them."""
+    """Return the sweeps of a result, including the actor visibility that the run determined."""
     if result.points.sweeps is None:
         return Sweeps.from_survey(result.survey, result.scene)
     sweeps: Sweeps = result.points.sweeps()

@@ -83,7 +83,7 @@ _NOT_RECORDED = ("beam divergence", "returns per pulse", "noise")
 
 
 def check_pattern_file(path: Path, *, as_rays: bool | None = None) -> None:
-    """Raise LidarError unless a file name extension matches a pattern.
+    """Raise LidarError unless a file name extension matches the type of a pattern.
 
     If `as_rays` is None, the pattern may be a sensor model or a list of rays.
     """

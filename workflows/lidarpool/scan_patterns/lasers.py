@@ -354,7 +354,7 @@ def _noise_slope(x: Floats, y: Floats) -> float:
     """Return the largest slope of y over x that noise alone can cause.
 
     The rounding of coordinates changes the range and the elevation of a point together. If all
-    returns of a ring have almost the same range, this is all that the slope shows. The noise is
+    returns of a ring have almost the same range, the slope reflects only this noise. The noise is
     estimated from the differences between neighbors.
     """
     variance = float(np.var(np.clip(x, *np.quantile(x, (0.01, 0.99)))))

@@ -259,7 +259,7 @@ def _georeferencing_notes(scenario: Scenario) -> Iterator[str]:
     if imu is not None and imu != Imu(rate_hz=imu.rate_hz, mount=imu.mount) and not attitude:
         yield (
             "the errors of `navigation.imu` affect its samples, but the measured trajectory has no "
-            "errors of the attitude. Set `navigation.imu.roll_pitch_deg` and `heading_deg`"
+            "attitude errors. Set `navigation.imu.roll_pitch_deg` and `heading_deg`"
         )
     if not mount and not attitude and gnss in (None, gnss and Gnss(rate_hz=gnss.rate_hz)):
         yield (

@@ -50,15 +50,15 @@ from .sections import (
 MAX_CANDIDATES = 10_000  # combinations of mounts
 MAX_POSITIONS = 100_000  # positions and headings of all targets
 MAX_CELLS = 4_000_000  # cells of the blind-area map
-DEFAULT_HEIGHT_M = 0.3  # height whose blind area counts, unless the map lacks it
+DEFAULT_HEIGHT_M = 0.3  # default height for the blind area in the score, if it is in the map
 _FORM = "A vehicle file contains body:, sensors: and optionally targets:, region: and map:"
 
 
 class BodyPart(Section):
     """A part of the vehicle body, which is a built-in car, a mesh file or a box.
 
-    In YAML, the name of a built-in car or of a file alone is sufficient. In the frame of the
-    vehicle, x is forward, y is left, and z is up. Its origin is on the ground.
+    In YAML, the name of a built-in car or of a file is sufficient. In the frame of the vehicle, x
+    is forward, y is left, and z is up. Its origin is on the ground.
     """
 
     model: Annotated[
@@ -107,7 +107,7 @@ AngleRange = Annotated[MinMax[AngleDeg], _accept_number(AngleDeg | MinMax[AngleD
 class MountRanges(Section):
     """Ranges of positions and angles in which a mount is searched.
 
-    A number fixes a value. The angles are those of a pose.
+    A single number fixes the value. The angles are those of a pose.
     """
 
     x: Annotated[CoordinateRange, about("minimum and maximum of x, in meters", [0.5, 1.5])]
@@ -195,7 +195,7 @@ class TargetSection(Section):
     ] = None
     points: Annotated[
         int,
-        about("number of points from which on a target counts as detected", ge=1, le=1_000_000),
+        about("minimum number of points on a detected target", ge=1, le=1_000_000),
     ] = 5
     reflectance: Annotated[UnitShare, about("reflectance of the target")] = 0.1
     weight: Annotated[
@@ -227,7 +227,7 @@ class RegionSection(Section):
         about("horizontal distances from the origin of the vehicle, in meters", min_length=1),
     ] = (3, 5, 8, 12, 18, 27, 40)
     bearings: Annotated[
-        int, about("number of bearings, evenly spaced from straight ahead", ge=1, le=720)
+        int, about("number of evenly spaced bearings, starting straight ahead", ge=1, le=720)
     ] = 24
     headings_deg: Annotated[
         Several[AngleDeg],
@@ -238,7 +238,7 @@ class RegionSection(Section):
 class TrafficTargets(Section):
     """Targets at the positions of the actors in a scenario, relative to its platform.
 
-    In YAML, the file name of the scenario alone is sufficient.
+    In YAML, the file name of the scenario is sufficient.
     """
 
     scenario: Annotated[
@@ -264,7 +264,7 @@ class MapSection(Section):
     """The map of the blind area around the vehicle."""
 
     margin_m: Annotated[
-        float, about("distance by which the map extends beyond the vehicle", gt=0, le=200)
+        float, about("distance in meters by which the map extends beyond the vehicle", gt=0, le=200)
     ] = 10.0
     cell_m: Annotated[float, about("side length of a cell, in meters", ge=0.02, le=10)] = 0.25
     heights_m: Annotated[
@@ -287,8 +287,9 @@ class RankSection(Section):
     height_m: Annotated[
         float | None,
         about(
-            f"height in map.heights_m whose blind area counts (default: {DEFAULT_HEIGHT_M:g}, or "
-            "the lowest above the ground if map.heights_m does not contain it)",
+            "height in map.heights_m for which the blind area is part of the score (default: "
+            f"{DEFAULT_HEIGHT_M:g}, or the lowest height above 0 if map.heights_m does not contain "
+            "it)",
             0.3,
             ge=0,
             le=10,
@@ -322,7 +323,7 @@ class VehicleFile(Section):
     body, sensors, targets, region, traffic, map, rank, search
         See the sections in this module.
     combine
-        How the mounts of several sensors are combined to candidates.
+        How the mounts of several sensors are combined into candidates.
     weather, noise, returns
         As in a scenario.
     """
@@ -350,8 +351,8 @@ class VehicleFile(Section):
     combine: Annotated[
         Literal["all", "names"],
         about(
-            "candidates: all combinations of the sensors' mounts, or mounts with equal names; a "
-            "sensor with a single mount belongs to all candidates"
+            "candidates: all combinations of the sensors' mounts, or mounts with the same name; a "
+            "sensor with a single mount is part of all candidates"
         ),
     ] = "all"
     targets: Annotated[
@@ -390,7 +391,7 @@ class VehicleFile(Section):
 
     @property
     def files(self) -> Scenario:
-        """Scenario without sections, relative to whose folder the file names are."""
+        """Empty scenario whose folder is the base of relative file names."""
         return self._files
 
     @classmethod
@@ -461,7 +462,7 @@ class VehicleFile(Section):
 
     @property
     def ranked_height_m(self) -> float:
-        """Height of the map whose blind area counts in the score, in meters."""
+        """Height for which the blind area is part of the score, in meters."""
         if self.rank.height_m is not None:
             return self.rank.height_m
         heights = sorted(self.map.heights_m)
@@ -541,6 +542,6 @@ class VehicleFile(Section):
                 for name, mounts in several.items()
             ]
             yield (
-                "`combine: names` requires the same names of mounts for all sensors with several "
+                "`combine: names` requires the same mount names for all sensors with several "
                 f"mounts, but {', and '.join(described)}."
             )

@@ -241,8 +241,8 @@ class Scenario(Section):
     flight: Annotated[
         FlightSection | None,
         about(
-            "plan of an airborne survey, as written by `lidarpool flight`, with which `lidarpool "
-            "check` and the report compare the density"
+            "plan of an airborne survey, as written by `lidarpool flight`; `lidarpool check` and "
+            "the report compare the density with it"
         ),
     ] = None
     faults: Annotated[

@@ -745,7 +745,7 @@ Ring = Annotated[Several[Pair], Field(min_length=3)]
 
 
 class FlightSection(Section):
-    """Plan of an airborne survey, with which the density of the points is compared."""
+    """Plan of an airborne survey, with which the point density is compared."""
 
     density_m2: Annotated[
         float, about("planned number of points per square meter", 20, gt=0, le=1e6)

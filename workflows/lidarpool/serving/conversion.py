@@ -14,8 +14,8 @@ from lidarsim.words import printable
 from .messages import message_class
 from .served_scene import Drive, FramePoses, SensorPoints, SweepRequest
 
-MAX_OBJECTS = 10_000  # objects of a request
-_MAX_LETTERS = 256  # of the name of an object
+MAX_OBJECTS = 10_000  # maximum number of objects in a request
+_MAX_LETTERS = 256  # maximum length of an object name
 _MAX_START_US = 1 << 62
 
 

@@ -1,4 +1,4 @@
-"""A scene whose sweeps are simulated at the poses that requests state."""
+"""A scene in which sweeps are simulated at requested poses."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from ..scenario.scenario import Scenario
 from ..scenario.sections import OutputSection, SensorSection
 from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 
-# Maximum difference between the duration of a frame and that of a sweep of the sensor. The rotation
-# rate of a real sensor varies as well.
+# Maximum relative difference between the durations of a frame and of a sweep. The rotation rate of
+# a real sensor also varies.
 _MAX_STRETCH = 0.1
 _MAX_NUMBER = 1_000_000  # sweeps after which the random numbers repeat
 # Coordinates are stored as 32-bit integers, in units of the precision.
@@ -90,7 +90,7 @@ class Drive(NamedTuple):
 
 
 class ServedSensor:
-    """A sensor in a scene, whose sweeps are simulated one after the other.
+    """A sensor in a scene, whose sweeps are simulated one after another.
 
     Parameters
     ----------
@@ -99,8 +99,7 @@ class ServedSensor:
     sensor
         The sensor, and the options of its scanner.
     centers
-        Centers of the boxes of actors in the frames of the actors, by name. The default is the
-        center of the mesh.
+        Box center of each actor in its own frame, by name. The default is the center of the mesh.
     backend
         Ray-casting backend, as in `Scanner`.
     """
@@ -139,7 +138,7 @@ class ServedSensor:
         Raises
         ------
         LidarError
-            If the duration of the frame does not suit the sensor, if a pose is too far away, or if
+            If the duration of the frame does not match the sensor, if a pose is too far away, or if
             an object is unknown.
         """
         frame_s = (request.end_us - request.start_us) / 1e6
@@ -166,7 +165,7 @@ class ServedSensor:
         return SensorPoints(positions.astype(np.float32), intensities)
 
     def prepare(self) -> None:
-        """Compile the loops by simulating sweeps, so that no request waits for it."""
+        """Compile the loops by simulating sweeps, so that no request waits for the compilation."""
         duration_us = round(self.period_s * 1e6)
         for distance_m in (0.0, 0.1):
             positions = np.array([[0.0, 0, 1], [distance_m, 0, 1]]) + self._scanner.origin
@@ -313,10 +312,10 @@ def _with_model(scenario: Scenario, model: str, rate_hz: float | None) -> Sensor
 
 
 def _box_centers(scenario: Scenario) -> dict[str, Floats]:
-    """Return the centers of the boxes of the actors that `lidarpool twin` has reconstructed.
+    """Return the box centers of the actors that `lidarpool twin` has reconstructed.
 
-    Their meshes contain only the observed sides. The box is in the report of the twin. Its
-    underside is centered on the origin of the actor.
+    The meshes of these actors contain only the observed sides, so the sizes of the boxes are read
+    from the report of the twin. The bottom face of a box is centered at the origin of the actor.
     """
     figures = scenario.path(FIGURES_FILE)
     recorded = {
@@ -335,7 +334,7 @@ def _box_centers(scenario: Scenario) -> dict[str, Floats]:
 
 
 def _idle_trajectory(actor: Actor) -> Trajectory:
-    """Return the trajectory of an actor that a request does not contain."""
+    """Return the trajectory of an actor that is not in a request."""
     path = actor.trajectory
     if not path.moves:
         return path

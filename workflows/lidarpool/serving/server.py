@@ -26,7 +26,7 @@ _STOP_S = 2.0  # time for replies in progress when the server stops
 
 
 class Endpoint(NamedTuple):
-    """Address on which a server listens, and the token that clients need, or None."""
+    """Address on which a server listens, and the token that clients must send, if any."""
 
     address: Address
     token: str | None
@@ -40,7 +40,7 @@ class Endpoint(NamedTuple):
         listen
             Address and port. The default is a free port on 127.0.0.1.
         token_file
-            File with the token. Without a token, only this machine can be served.
+            File with the token. Without a token, only clients on this machine can connect.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class Endpoint(NamedTuple):
 
 
 class SensorServer:
-    """A server that answers requests while its context is entered.
+    """A server that answers requests inside a `with` block.
 
     Parameters
     ----------

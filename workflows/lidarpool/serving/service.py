@@ -18,12 +18,12 @@ from .conversion import points_message, sweep_request, trajectory_message
 from .messages import DEVICES, METHODS, SERVICE, message_class
 from .served_scene import SensorPoints, ServedScene
 
-MAX_POINTS = 2_000_000  # points of a reply; as lists and buffers, they take 64 MB
-_MAX_SWEEPS = 16  # sweeps of an aggregated request
+MAX_POINTS = 2_000_000  # maximum number of points in a reply; as lists and buffers, 64 MB
+_MAX_SWEEPS = 16  # maximum number of sweeps in an aggregated request
 _API_VERSION = {"major": 0, "minor": 54, "patch": 0}  # of the protocol that was implemented
 _CAMERA_METHODS = ("render_rgb", "batch_render_rgb")
 _NO_CAMERAS = "lidarpool simulates lidars and has no cameras. Call render_lidar."
-_MAX_NOTES = 20  # notes about objects that are ignored
+_MAX_NOTES = 20  # maximum number of notes about ignored objects
 
 Context = Any  # grpc.ServicerContext
 
@@ -37,7 +37,7 @@ class RequestError(LidarError):
 
 
 class SensorService:
-    """Answers to the requests of simulators.
+    """Service that answers requests from simulators.
 
     Several threads can call the service.
 
@@ -48,7 +48,7 @@ class SensorService:
     report
         Function that shows a note to the user of the server.
     ignores_unknown
-        Whether objects that the scene does not have are ignored. Otherwise, the request is refused.
+        Whether objects that are not in the scene are ignored. Otherwise, the request is refused.
     """
 
     def __init__(

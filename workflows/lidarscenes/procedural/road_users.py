@@ -16,16 +16,16 @@ from .cars import MODELS, car
 from .city_kinds import Solid, lay_down, loft, regular_polygon
 from .people import pedestrian
 
-CHILD_M = 1.1  # height of a child of five years
+CHILD_M = 1.1  # height of a five-year-old child
 _CURB_M = (4.0, 0.15, 0.15)  # length, width and height
 _CONE_M = 0.75  # height
 _WHEEL_M = 0.34  # radius of a bicycle wheel
 _AXLES_M = (0.53, -0.53)
-_TUBE_M = 0.025  # half width of the tubes of a frame
+_TUBE_M = 0.025  # half width of the frame tubes
 
 
 def child() -> SceneMesh:
-    """Return a child of 1.1 m in mid-stride, facing x, with the feet at z = 0."""
+    """Return a child that is 1.1 m tall, in mid-stride, facing x, with the feet at z = 0."""
     adult = pedestrian()
     scale = CHILD_M / float(adult.vertices[:, 2].max())
     return replace(adult, name="child", vertices=adult.vertices * scale)
@@ -62,12 +62,12 @@ def cyclist() -> SceneMesh:
 
 
 def curb() -> SceneMesh:
-    """Return a piece of a curb along x that is 4 m long, 0.15 m wide and 0.15 m high."""
+    """Return a curb segment along x that is 4 m long, 0.15 m wide and 0.15 m high."""
     return box("curb", _CURB_M)
 
 
 def cone() -> SceneMesh:
-    """Return a traffic cone of 0.75 m on a square foot."""
+    """Return a traffic cone that is 0.75 m tall, on a square base."""
     foot = loft(np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.2, [(0, 0), (0.03, 0)])
     body = loft(regular_polygon(12, 0.15), [(0.03, 0), (_CONE_M, 0.12)])
     return SceneMesh("cone", *stack_meshes([foot, body]))

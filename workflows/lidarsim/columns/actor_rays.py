@@ -1,7 +1,7 @@
-"""Records of how the rays of a sweep meet each actor, from which the visibility of actors follows.
+"""Ray counts and distances per actor and sweep, from which actor visibility is computed.
 
 The workers that cast the rays compute the records of their scans. `merge_actor_rays` combines the
-records of a survey, with a result that does not depend on how scans were grouped.
+records of a survey. The result does not depend on how scans were grouped.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class PartColumns:
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))  # (scans,)
     # (scans, samples, 3), end points of sampled rays in local coordinates, meters; NaN if unused
     samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-    # (k,), how rays of the scans meet actors, of type `ACTOR_RAYS`
+    # (k,), visibility records of actors in the scans, of type `ACTOR_RAYS`
     actor_rays: Records = field(default_factory=NO_ACTOR_RAYS.copy)
 
     def __len__(self) -> int:

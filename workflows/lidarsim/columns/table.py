@@ -314,7 +314,8 @@ OPTIONAL = (
             f"true_{axis}",
             "float64",
             "m",
-            f"{axis} coordinate of the point by the true trajectory, in world coordinates",
+            f"{axis} coordinate of the point according to the true trajectory, in world "
+            "coordinates",
             coordinates="world",
         )
         for axis in "xyz"

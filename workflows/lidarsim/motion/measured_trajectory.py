@@ -1,7 +1,7 @@
-"""The trajectory that a navigation system measures, by which points can be georeferenced.
+"""The trajectory that a navigation system measures, with which points can be georeferenced.
 
 The measured trajectory is the true trajectory with the errors of the GNSS receiver and of the
-measured attitude. Both are computed from the first sample on, so every process obtains the same
+measured attitude. Both are always computed from the first sample, so all processes obtain the same
 poses.
 """
 
@@ -57,9 +57,9 @@ class MeasuredTrajectory:
     path
         The true trajectory.
     position_errors
-        Errors of the position to the east, north and up in meters, or None.
+        Position errors to the east, north and up, in meters, or None.
     attitude_errors
-        Errors of roll, pitch and heading about the axes of the platform in degrees, or None.
+        Roll, pitch and heading errors about the platform axes, in degrees, or None.
     """
 
     path: Trajectory
@@ -107,7 +107,7 @@ class MeasuredTrajectory:
     def georeference(
         self, points: Floats, times_ns: Floats, mount: Pose, measured_mount: Pose
     ) -> Floats:
-        """Move points from where they are to where the measured trajectory places them.
+        """Transform points from the true trajectory to the measured trajectory.
 
         Parameters
         ----------

@@ -68,8 +68,8 @@ class Imu(FileSection):
     By default, the measurements have no errors.
 
     `mount` is the pose of the IMU in the platform frame. The noise parameters have the names and
-    units of Kalibr's `imu.yaml`. They affect the samples of the IMU. The errors of roll, pitch and
-    heading are those of the attitude that a navigation system computes, and only affect the
+    units of Kalibr's `imu.yaml`. They affect the samples of the IMU. The roll, pitch and heading
+    errors are errors of the attitude that a navigation system computes, and only affect the
     measured trajectory.
 
     Raises
@@ -187,7 +187,7 @@ class Gnss(FileSection):
     offset_m: Annotated[
         Triple,
         about(
-            "constant error to the east, north and up in meters, such as that of a base station",
+            "constant error to the east, north and up in meters, such as a base station error",
             [0.05, 0, -0.1],
         ),
     ] = (0, 0, 0)
@@ -215,9 +215,9 @@ class Navigation(FileSection):
     seed
         Seed for the measurement errors.
     mount_error
-        Error of the calibrated mounts of the sensors. The position is the error of the lever arm in
-        the platform frame, and the angles are the boresight errors about the platform's axes. It
-        affects points that are georeferenced by the measured trajectory.
+        Calibration error of the sensor mounts. The position is the lever arm error in the platform
+        frame, and the angles are the boresight errors about the platform's axes. It affects points
+        that are georeferenced by the measured trajectory.
 
     Raises
     ------
@@ -253,7 +253,7 @@ class Navigation(FileSection):
         Pose,
         AT_CENTER,
         about(
-            "error of the calibrated mounts of all sensors, for `cloud.georeferencing: measured`: "
+            "calibration error of all sensor mounts, for `cloud.georeferencing: measured`: "
             "the position is the lever arm error in meters, and the angles are the boresight "
             "errors in degrees, in the platform frame",
             {"position": [0.01, 0, 0], "roll_deg": 0.01},
@@ -425,7 +425,7 @@ def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFix
 
 
 class GnssErrors:
-    """Errors of consecutive positions from a GNSS receiver, including outages that an IMU bridges.
+    """Errors of consecutive GNSS positions, including those in outages that an IMU bridges.
 
     Errors must be requested in order.
     """
@@ -460,7 +460,7 @@ class GnssErrors:
 
 
 class AttitudeErrors:
-    """Errors of roll, pitch and heading that a navigation system measures, in degrees.
+    """Roll, pitch and heading errors of a navigation system, in degrees.
 
     Errors must be requested in order.
     """
@@ -478,7 +478,7 @@ class AttitudeErrors:
         )
 
     def next_errors(self, samples: Ints) -> Floats:
-        """Return the errors of roll, pitch and heading for the next samples in degrees.
+        """Return the roll, pitch and heading errors of the next samples in degrees.
 
         For indices of shape (k,), the result has shape (k, 3).
         """

@@ -73,7 +73,7 @@ def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def hash_rows(*columns: NDArray[np.integer]) -> NDArray[np.uint64]:
     """Return a 64-bit hash of each row of integer columns.
 
-    The columns have shape (n,), and so has the result. Two different rows have the same hash with a
+    The columns and the result have shape (n,). Two different rows have the same hash with a
     probability of 2**-64.
     """
     state = np.zeros(len(columns[0]), np.uint64)

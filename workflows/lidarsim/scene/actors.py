@@ -250,7 +250,7 @@ def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
 
 
 def distinct_meshes(meshes: Iterable[SceneMesh]) -> tuple[list[SceneMesh], Indices]:
-    """Return the distinct meshes, and the index of the distinct mesh for each mesh.
+    """Return the distinct meshes, and for each mesh the index of its distinct mesh.
 
     Two meshes are the same if they share their arrays, even if their names differ. Pickling
     preserves this.

@@ -313,7 +313,7 @@ class Rig:
     ) -> tuple[Firings, Pattern, CastPoses, tuple[int, int]]:
         """Return the firings of consecutive scans, and their rays as rows of a pattern with poses.
 
-        The last value has the first row of the rays in the pattern, and one past the last.
+        The last value contains the first pattern row of the rays, and one past the last.
         """
         number = specs[0].sensor
         repeated, by_head = self._rays_of_sensor(number, path.moves)
@@ -335,7 +335,7 @@ class Rig:
     def _actor_rays(
         self, specs: list[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]
     ) -> Records:
-        """Return how the rays of scans meet actors, if the survey determines their visibility."""
+        """Return the visibility records of actors in scans, or none if they are not required."""
         if not self._visibilities:
             return NO_ACTOR_RAYS
         return self._visibilities[specs[0].sensor].count(specs, pattern, poses, window)

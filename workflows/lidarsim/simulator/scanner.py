@@ -246,9 +246,9 @@ class Scanner:
             Start of the revolution in seconds since the start of the trajectories of the sensor and
             the actors. The default is `number` times the duration of a revolution, as in a survey.
         stream
-            Number of the stream of random numbers, which are independent of those of other streams.
-            Use a different stream for each of several lidars of the same model that share the
-            scanner.
+            Index of the random number stream. The random numbers of different streams are
+            independent. Use a different stream for each of several lidars of the same model that
+            share the scanner.
 
         Returns
         -------

@@ -186,8 +186,8 @@ class CloudOptions(FileSection):
     georeferencing: Annotated[
         Literal["exact", "measured"],
         about(
-            "trajectory and mounts by which points are transformed to world coordinates: exact, or "
-            "measured with the errors in `navigation`"
+            "trajectory and mounts that transform points to world coordinates: exact, or measured "
+            "with the errors in `navigation`"
         ),
     ] = "exact"
     columns: Annotated[
@@ -271,7 +271,7 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns. The default is that of the sensor.
     navigation
         IMU and GNSS receiver of the platform, whose samples are written to files next to the cloud.
-        With `georeferencing="measured"`, points contain their errors and those of the mounts.
+        With `georeferencing="measured"`, the points contain their errors and those of the mounts.
     faults
         Sensor faults, such as dirt or lost packets.
     classes
@@ -530,7 +530,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def measured(self) -> MeasuredTrajectory | None:
-        """Trajectory by which points are georeferenced, or None if it is the true trajectory."""
+        """Trajectory with which points are georeferenced, or None if it is the true trajectory."""
         return MeasuredTrajectory.from_drive(self) if self.georeferencing == "measured" else None
 
     @property

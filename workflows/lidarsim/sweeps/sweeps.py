@@ -189,8 +189,8 @@ class Sweeps:
     # The array is empty if no actor moves.
     actor_rows: Ints32 = field(default_factory=lambda: NO_ROWS)
     actor_knots: Floats32 = field(default_factory=lambda: STILL)  # (r, k, 7); see `ActorSweeps`
-    # (a, n), how the rays of each sweep meet each actor, of type `ACTOR_RAYS`. The array is empty
-    # if the survey does not determine the visibility of actors.
+    # (a, n), visibility records of each actor in each sweep, of type `ACTOR_RAYS`. The array is
+    # empty if the survey does not determine the visibility of actors.
     actor_rays: Records = field(default_factory=lambda: NO_ACTOR_RAYS[None])
     # Whether `points` moves points on actors to their positions at the start of the sweep.
     actors_at_start: bool = False
@@ -406,9 +406,9 @@ class Sweeps:
     def _flow_of_actors_at_start(
         self, sweep: int, points: Cloud, masks: Mapping[int, Bools]
     ) -> dict[str, AnyArray]:
-        """Return the flow of points on actors from the start of a sweep to that of the next sweep.
+        """Return the flow of points on actors between the starts of a sweep and the next sweep.
 
-        `masks` has the points (k,) of each actor.
+        `masks` contains a mask of the points on each actor.
         """
         names = [name for name in (FLOW, FLOW_EGO) if points.columns.keys() >= {*name}]
         if not names:

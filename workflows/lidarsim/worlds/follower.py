@@ -53,7 +53,7 @@ class _StepLog:
         self.span_s: tuple[float, float] | None = None
 
     def precedes(self, time_s: float) -> bool:
-        """Return whether the last step is not after a time."""
+        """Return whether the last step, if there is one, is not later than a time."""
         return not self.steps or self.start_s + self.steps[-1].time_s <= time_s
 
     def add(self, step: _Step) -> None:

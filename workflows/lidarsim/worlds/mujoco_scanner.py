@@ -197,8 +197,8 @@ class MujocoScanner:
         """
         if not hasattr(data, "site_xpos"):
             raise LidarError(
-                f"Expected an mjData, but got an object of type {type(data).__name__!r}. Pass for "
-                "example `mujoco.MjData(model)`."
+                f"Expected an mjData, but got an object of type {type(data).__name__!r}. For "
+                "example, pass `mujoco.MjData(model)`."
             )
         if self._kind == "site":
             return _matrices(data.site_xpos, data.site_xmat, self._frames)

@@ -143,7 +143,7 @@ class NewtonModel(NamedTuple):
 def as_numpy(values: Any, columns: int = 1) -> AnyArray:
     """Copy a Warp array (n,) or (n, columns) to a NumPy array of type float64.
 
-    None is an empty array.
+    None is converted to an empty array.
     """
     if values is None:
         return np.zeros((0, columns))
@@ -152,7 +152,7 @@ def as_numpy(values: Any, columns: int = 1) -> AnyArray:
 
 
 def matrices_of(transforms: Floats) -> Floats:
-    """Convert transforms of Newton to matrices.
+    """Convert Newton transforms to matrices.
 
     The transforms (n, 7) are positions and quaternions (x, y, z, w), and the matrices have shape
     (n, 4, 4).

@@ -49,9 +49,10 @@ class _ScannedWorld(NamedTuple):
 class NewtonScanner:
     """Lidars in the worlds of a Newton model.
 
-    A Newton model can contain many worlds that are simulated together, such as the environments of
-    a training. Each lidar sees the bodies of its own world and those that all worlds share, except
-    for the bodies that carry a lidar. Results are lists or arrays with one entry for each lidar.
+    A Newton model can contain many worlds that are simulated together, such as the environments in
+    which a policy is trained. Each lidar sees the bodies of its own world and those that all worlds
+    share, except for the bodies that carry a lidar. Results are lists or arrays with one entry for
+    each lidar.
 
     The class only reads the arrays of the model and its states, on the CPU or on a GPU. It does not
     import Newton.
@@ -187,7 +188,7 @@ class NewtonScanner:
         Raises
         ------
         LidarError
-            If `state` is no state of the model, or if a body has no valid pose.
+            If `state` is not a state of the model, or if a body has no valid pose.
         """
         bodies = self._body_matrices(state)
         poses = self._poses(bodies)
@@ -243,7 +244,7 @@ class NewtonScanner:
         Raises
         ------
         LidarError
-            If an argument has a wrong type, if a body has no valid pose, or if nothing is
+            If an argument has the wrong type, if a body has no valid pose, or if nothing is
             stationary in all worlds.
         """
         time_s = _seconds(time_s)
@@ -288,7 +289,7 @@ class NewtonScanner:
         if not hasattr(state, "body_q"):
             raise LidarError(
                 f"Expected a single newton.State, but got an object of type "
-                f"{type(state).__name__!r}. Pass for example `model.state()`."
+                f"{type(state).__name__!r}. For example, pass `model.state()`."
             )
         matrices = matrices_of(as_numpy(state.body_q, 7))
         valid = np.isfinite(matrices).all(axis=(1, 2))
@@ -350,7 +351,7 @@ def _create_follower(
 ) -> Follower:
     """Create the follower of a world.
 
-    Its stationary objects are bodies if they have other poses in other worlds.
+    Its stationary objects are treated as bodies if they have different poses in other worlds.
     """
     objects = (*view.shared, *view.fixed, *view.moving)
     if not objects:

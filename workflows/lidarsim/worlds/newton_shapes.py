@@ -38,7 +38,7 @@ class ShapeType(IntEnum):
     GAUSSIAN = 11
 
 
-# Types without a surface. Splats are images of a surface.
+# Types without a surface. Gaussian splats only depict surfaces.
 INVISIBLE_TYPES = (ShapeType.NONE, ShapeType.GAUSSIAN)
 
 

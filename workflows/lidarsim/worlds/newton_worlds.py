@@ -85,7 +85,7 @@ class ObjectMeshes:
             self._by_world.setdefault(world, []).append(self._object(group))
 
     def view(self, world: int | None) -> WorldView:
-        """Return what the lidars in a world see, or in all worlds if `world` is None."""
+        """Return the objects that lidars see in a world, or in all worlds if `world` is None."""
         shared = self._by_world.get(-1, [])
         own = [
             item

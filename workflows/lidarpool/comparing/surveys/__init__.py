@@ -1,4 +1,4 @@
-"""Comparison of survey clouds in world coordinates, in the terms that surveyors use."""
+"""Comparison of survey clouds in world coordinates, with the statistics that surveyors use."""
 
 from .comparing_surveys import compare_strips, compare_surveys
 from .survey_comparison import SurveyComparison

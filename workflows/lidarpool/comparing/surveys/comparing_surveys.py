@@ -66,14 +66,14 @@ def compare_surveys(
     sensor_a, sensor_b
         Name of the sensor to compare (default: all sensors).
     unit_a, unit_b
-        Length unit of a file that does not state it, or of the mesh.
+        Length unit of a mesh, or of a file that does not state its unit.
     up_axis
         Up axis of the mesh: x, y or z.
     keep_noise
         Whether to include points that are withheld or classified as noise.
     radius_m
         Radius of the neighborhoods that determine planes, and of the cylinders of M3C2, in meters.
-        By default, half of the points of B have at least 20 neighbors within it.
+        The default is a radius within which half of the points of B have at least 20 neighbors.
     max_distance_m
         Maximum distance from B in meters (default: 1). Points that are farther away have no
         counterpart.

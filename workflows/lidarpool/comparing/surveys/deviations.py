@@ -14,7 +14,7 @@ STATISTICS = ("mean_m", "std_m", "rmse_m", "median_m", "p95_abs_m", "min_m", "ma
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Deviations of A from B at n places."""
+    """Deviations of A from B at n positions."""
 
     points: Floats  # (n, 3): world coordinates in meters
     # {name: values of shape (n,)} in meters, such as `delta_h` or `distance`.

@@ -32,7 +32,7 @@ def m3c2_deviations(
     radius_m
         Radius of the neighborhoods and of the cylinders.
     max_distance_m
-        Half of the length of the cylinders.
+        Half the length of the cylinders.
     """
     require_package("py4dgeo", "m3c2", "`--survey m3c2`")
     import py4dgeo

@@ -19,7 +19,7 @@ from .deviations import Deviations
 
 _BATCH = 200_000
 _HEAD_BYTES = 4096
-# Cloud formats that are also mesh formats, and formats whose contents are not surfaces to measure.
+# Cloud formats that are also mesh formats, and formats that do not contain surfaces.
 _CLOUDS = (".ply", ".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".pcd", ".las", ".laz", ".npy")
 
 
@@ -84,7 +84,7 @@ def mesh_deviations(
 
 
 def _triangles(path: Path, notes: list[str], options: dict[str, Any]) -> Floats:
-    """Return the corners of all triangles with an area, of shape (f, 3, 3), in meters."""
+    """Return the corners of all triangles with nonzero area, in meters. Shape (f, 3, 3)."""
     meshes = load_meshes(path, report=lambda text: notes.append(text.rstrip(".")), **options)
     solid = [item.flat() if isinstance(item, SceneInstance) else item for item in meshes]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid])
@@ -107,7 +107,7 @@ def _is_closed(corners: Floats) -> bool:
 
 
 class _Surface:
-    """Triangles in coordinates near zero.
+    """Triangles in coordinates close to the origin.
 
     Open3D finds the nearest triangle in single precision. The distance to it is computed in double
     precision.

@@ -18,7 +18,7 @@ from lidarsim.words import plural
 from .deviations import Deviations
 from .survey_clouds import SENSOR, SurveyCloud
 
-_TIMES = ("time", "gps_time")  # of results, and of LAS files
+_TIMES = ("time", "gps_time")  # in results and in LAS files
 _TIME_STEP_S = 1e-7  # resolution of times in floating point numbers
 _MIN_SHARE = 0.01  # minimum share of the smaller cloud that must have a pair
 _BITS = 2**64
@@ -89,7 +89,7 @@ def pair_deviations(
     """Return A - B for all pairs of points, or None if hardly any points have a pair.
 
     At most about `max_points` points of each cloud are kept in memory. They are selected by their
-    keys, so that both points of a pair are kept or omitted.
+    keys, so that the points of a pair are either both kept or both omitted.
     """
     sampled = [_Sampled.read(cloud, key, max_points) for cloud in (a, b)]
     limit = min(one.limit for one in sampled)
@@ -124,7 +124,7 @@ class _Matching(NamedTuple):
     a: _KeyedPoints
     b: _KeyedPoints
     unpaired: tuple[int, int]  # numbers of points without a counterpart
-    ambiguous: tuple[int, int]  # numbers of points whose key occurs repeatedly
+    ambiguous: tuple[int, int]  # numbers of points whose key is not unique
 
     @classmethod
     def find(cls, a: _KeyedPoints, b: _KeyedPoints) -> _Matching:
@@ -139,7 +139,7 @@ class _Matching(NamedTuple):
 
     @property
     def is_sufficient(self) -> bool:
-        """Whether a considerable part of the smaller cloud has a pair."""
+        """Whether a sufficient share of the smaller cloud is paired."""
         count = len(self.a.keys)
         sizes = (count + sum(of) for of in zip(self.unpaired, self.ambiguous, strict=True))
         return count > 0 and count >= _MIN_SHARE * min(sizes)

@@ -16,7 +16,7 @@ from .deviations import Deviations
 _BATCH = 100_000  # points per batch, which limits the memory for their neighbors
 _NEIGHBORS = 24  # maximum number of points that determine a plane
 _MIN_NEIGHBORS = 6
-_MIN_WIDTH = 0.2  # minimum width of a neighborhood relative to its length; lines have no plane
+_MIN_WIDTH = 0.2  # minimum width of a neighborhood relative to its length, to exclude lines
 _SAMPLES = 2000
 _LEVEL = 0.05  # normals with a smaller vertical component are horizontal (3 degrees)
 
@@ -29,9 +29,9 @@ class _Planes(NamedTuple):
 
 
 def neighborhood_radius(points: Floats) -> float:
-    """Return a radius within which half of the points have at least 20 neighbors, in meters.
+    """Return the radius in meters within which half of the points have at least 20 neighbors.
 
-    It has two significant digits.
+    It is rounded to two significant digits.
     """
     count = min(20, len(points) - 1)
     if count < _MIN_NEIGHBORS:
@@ -48,9 +48,9 @@ def plane_deviations(
 ) -> Deviations:
     """Return the signed distances from points to planes through the reference.
 
-    The plane of a point is fitted to the up to 24 nearest neighbors, within `radius_m`, of the
-    nearest reference point. Distances are positive above the plane, and in front of a vertical
-    plane that faces east, or north if it is parallel to east.
+    The plane for a point is fitted to the neighbors of the nearest reference point within
+    `radius_m`, at most 24. Distances are positive above the plane. Vertical planes face east, or
+    north if they are parallel to the east axis.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def _fit_planes(search: NeighborSearch, reference: Floats, rows: Floats, origin:
 
 
 def orient_normals(normals: Floats) -> Floats:
-    """Reverse normals so that they point up, or, if they are level, east or north.
+    """Orient normals so that they point up or, if they are horizontal, east or north.
 
     The shape is (n, 3).
 

@@ -1,8 +1,8 @@
 """Height differences between overlapping strips, in the cells of a horizontal grid.
 
 A plane is fitted to the points of each strip in each cell, so that slopes and different point
-positions do not cause differences. Points are only added to sums, so memory depends on the number
-of cells.
+positions do not cause differences. Only sums over the points are stored, so the memory depends on
+the number of cells.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ SOURCE = "point_source_id"
 _MIN_POINTS = 5  # minimum number of points per strip in a cell; three always lie on a plane
 _MAX_ROWS = 12_000_000  # maximum number of cells of all strips, about 1.5 GB
 _PENDING_ROWS = 4_000_000  # rows that are merged together
-# Points on a line determine no plane, and a plane is not extrapolated far. Both values are relative
-# to the width of a cell.
+# Collinear points do not determine a plane, and planes are not extrapolated far. Both values are
+# relative to the width of a cell.
 _MIN_SPREAD = 0.1  # minimum standard deviation of the positions in every direction
 _MAX_OFFSET = 0.3  # maximum distance between the mean positions of the points of two strips
 _MAX_STRIPS = 1 << 16
@@ -40,7 +40,7 @@ _SUMS = 10
 
 
 class _CellSums(NamedTuple):
-    keys: Ints  # (n,): number of the cell and of the strip
+    keys: Ints  # (n,): cell number and strip number
     sums: Floats  # (n, 10)
 
 
@@ -53,7 +53,7 @@ class StripSettings:
 
 
 class _Strips:
-    """Names of strips, which are numbered when they are first seen."""
+    """Names of strips, which are numbered in the order of their first points."""
 
     def __init__(self) -> None:
         self.numbers: dict[tuple[int, int, int], int] = {}  # by file, sensor and source
@@ -162,7 +162,7 @@ class _Grid:
 def _single_returns(part: Sweep) -> Indices:
     """Return the rows of points that are the only return of their pulse.
 
-    All points count if the number of returns is unknown.
+    If the number of returns is unknown, all rows are returned.
     """
     if "returns" not in part.columns:
         return np.arange(len(part))
@@ -170,7 +170,7 @@ def _single_returns(part: Sweep) -> Indices:
 
 
 def _sourced_parts(clouds: Sequence[SurveyCloud]) -> Iterator[tuple[int, Sweep, Ints]]:
-    """Yield the index of the file, its parts, and the source of each point."""
+    """Yield each part with the index of its file and the source of each point."""
     for file, cloud in enumerate(clouds):
         lines = [_line_starts_ns(recording) for recording in cloud.recordings]
         for part in cloud.parts():
@@ -246,7 +246,7 @@ class _Overlap(NamedTuple):
 
 
 def _cell_planes(cells: _CellSums, settings: StripSettings) -> _CellPlanes:
-    """Fit planes by least squares in the cells that have enough points which are not on a line."""
+    """Fit planes by least squares in cells with enough points that are not collinear."""
     sums = cells.sums
     rows = np.flatnonzero(sums[:, 0] >= _MIN_POINTS)
     rows = rows[_smallest_spread(sums[rows]) >= _MIN_SPREAD * settings.cell_m]
@@ -263,7 +263,7 @@ def _cell_planes(cells: _CellSums, settings: StripSettings) -> _CellPlanes:
 
 
 def _smallest_spread(sums: Floats) -> Floats:
-    """Return the standard deviation of the positions in each cell, in the narrowest direction."""
+    """Return the smallest standard deviation of the positions in each cell over all directions."""
     n, x, y, _, xx, xy, yy = sums[:, :7].T
     a, b, c = (xx - x * x / n) / n, (xy - x * y / n) / n, (yy - y * y / n) / n
     smallest = (a + c) / 2 - np.hypot((a - c) / 2, b)  # eigenvalue of ((a, b), (b, c))

@@ -26,10 +26,10 @@ _MAPPED = ("delta_e", "delta_n", "delta_h", "distance")
 _MAX_CELLS = 240  # cells of a map along its longer side
 _MIN_CELLS = 12
 _POINTS_PER_CELL = 4
-_WIDE = 1.6  # maps of areas that are wider than this are drawn one below the other
+_WIDE = 1.6  # aspect ratio of an area above which its maps are drawn one below the other
 _MIN_LIMIT_M = 1e-4  # end of the color scale if there are no deviations
 _BINS = 80
-# Colors of histograms.
+# Color of histogram bars.
 _BAR_COLOR = "#4477aa"
 
 
@@ -43,7 +43,7 @@ class _MapLayout(NamedTuple):
 
     @classmethod
     def for_area(cls, count: int, aspect: float) -> _MapLayout:
-        """Return the layout of `count` maps. `aspect` is the width of the area by its height."""
+        """Return the layout of `count` maps of an area with the given width-to-height ratio."""
         columns = 1 if aspect > _WIDE else count
         rows = count // columns
         total = (_RIGHT - _LEFT) * _WIDTH
@@ -118,7 +118,7 @@ class _Area(NamedTuple):
     def around(cls, positions: Floats, cell_m: float | None) -> _Area:
         """Return the area that contains positions, of shape (n, 2).
 
-        `cell_m` is the width of the cells whose centers the positions are, or None.
+        `cell_m` is the cell width if the positions are cell centers, otherwise None.
         """
         margin = (cell_m or 0.0) / 2
         lower, upper = positions.min(axis=0) - margin, positions.max(axis=0) + margin
@@ -155,7 +155,7 @@ class _Area(NamedTuple):
 
 
 def _cell_side(extent_m: float, points: int, cell_m: float | None) -> float:
-    """Return the width of a cell of a map. It is a multiple of the cells of strips, if any."""
+    """Return the cell width of a map. It is a multiple of `cell_m`, if given."""
     if cell_m is not None:
         return cell_m * max(int(np.ceil(extent_m / cell_m / _MAX_CELLS)), 1)
     return extent_m / float(np.clip(np.sqrt(points / _POINTS_PER_CELL), _MIN_CELLS, _MAX_CELLS))

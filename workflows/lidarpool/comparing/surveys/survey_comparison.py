@@ -30,7 +30,7 @@ class SurveyComparison:
     """Result of `compare_surveys` and `compare_strips`, whose text representation is a table."""
 
     figures: dict[str, Any]  # content of compare.json; lengths are in meters
-    points: Floats  # (n, 3): world coordinates of the compared places, in meters
+    points: Floats  # (n, 3): world coordinates of the deviations, in meters
     components: dict[str, Floats]  # {name: deviations of shape (n,)} in meters
 
     def __repr__(self) -> str:

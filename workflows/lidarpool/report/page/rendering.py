@@ -415,7 +415,7 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def code_spans(text: str) -> Markup:
-    """Format the names between backticks in a message as code.
+    """Format text between backticks in a message as code.
 
     Examples
     --------

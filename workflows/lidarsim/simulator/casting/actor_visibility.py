@@ -30,7 +30,7 @@ from .scene_caster import NEVER_NS, SceneCaster
 from .stored_triangles import StoredTriangles
 
 _FIELD_RAYS = 1_000_000  # maximum number of rays from which a field of view is determined
-_CELLS = 8  # number of cells along each axis of a box, whose centers are in or out of the field
+_CELLS = 8  # cells along each axis of a box; their centers are inside or outside the field of view
 # A gap between azimuths limits the field of view if it is this wide and at least twice as wide as
 # all other gaps.
 _MIN_GAP_RAD = np.radians(10.0)
@@ -72,7 +72,7 @@ class FieldOfView:
 
 
 def _sector_of(azimuths: Floats) -> tuple[float, float]:
-    """Return the start and the width of the smallest sector with the given azimuths in radians."""
+    """Return the start and width of the smallest sector that contains azimuths, in radians."""
     ordered = np.unique(azimuths % (2 * np.pi))
     gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
     widest = int(gaps.argmax())
@@ -114,7 +114,7 @@ class _Boxes(NamedTuple):
 
 
 class ActorVisibility:
-    """Counts the rays of a sensor that meet each actor."""
+    """Counts the rays of a sensor that hit each actor."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class ActorVisibility:
     ) -> Records:
         """Return the records (k,) of consecutive scans at one station, of type `ACTOR_RAYS`.
 
-        `window` has the first row of the rays in the pattern, and one past the last.
+        `window` contains the first pattern row of the rays, and one past the last.
         """
         sweeps = [
             _SweepRays.empty(sweep, self._first_sweep + sweep, self._present_actors(sweep), *span)
@@ -210,7 +210,7 @@ class ActorVisibility:
                 sweep.records["rays"][sweep.records["actor"] == actor] += count
 
     def _measure_boxes(self, sweep: _SweepRays, chunks: Iterable[RayChunk]) -> None:
-        """Set the truncation of boxes, and the distance of rays from actors that no ray hits."""
+        """Set the truncation of boxes, and the distance between rays and actors without hits."""
         from . import box_distance_loops as loops  # imported here because numba is slow to import
 
         records = sweep.records

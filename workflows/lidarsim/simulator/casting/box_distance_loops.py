@@ -85,7 +85,7 @@ def nearest_boxes(rays, centers, rotations, halves, t_min, t_max, squares):  # n
         Boxes (b, 3), (b, 3, 3) and (b, 3): centers, rotations from the box to the scene frame, and
         half sizes.
     t_min, t_max
-        Part of each ray that counts, in meters.
+        Start and end of the considered part of each ray, in meters.
     squares
         float64 (b,): squared distances, which the loop reduces.
     """

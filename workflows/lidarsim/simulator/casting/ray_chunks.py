@@ -1,4 +1,4 @@
-"""Central rays of pulses in consecutive scans, in chunks that limit the memory."""
+"""Central rays of pulses in consecutive scans, in chunks that limit memory use."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def ray_chunks(
 ) -> Iterator[RayChunk]:
     """Yield the rays of consecutive scans at one station.
 
-    `window` has the first row of the rays in the pattern, and one past the last.
+    `window` contains the first pattern row of the rays, and one past the last.
     """
     first, stop = window
     step = max(1, CHUNK_RAYS // (poses.rays_per_pose or 1)) * (poses.rays_per_pose or 1)
@@ -65,7 +65,7 @@ def ray_chunks(
 
 
 def _is_blocked(sensor: Sensor, specs: Sequence[ScanSpec], start: int, count: int) -> Bools:
-    """Return whether the platform blocks each of `count` rays from ray `start` on."""
+    """Return whether the platform blocks each of `count` rays, starting with ray `start`."""
     if not len(sensor.beams.blocked):
         return np.zeros(count, np.bool_)
     rays = np.arange(start, start + count, dtype=np.int64)

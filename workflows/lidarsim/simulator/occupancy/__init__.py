@@ -1,4 +1,4 @@
-"""Voxel grids with the true classes of a scene, and what the rays of a sweep observe."""
+"""Voxel grids with the true classes of a scene, and the voxels that a sweep observes."""
 
 from .grid import FREE, GridFrame, Occupancy, VoxelGrid
 from .sweep_occupancy import OccupancySimulator

@@ -77,7 +77,7 @@ class Occupancy(NamedTuple):
     All arrays have the shape of the grid.
     """
 
-    classes: Ints32  # class of the surface or solid; 0 for surfaces without class and free voxels
+    classes: Ints32  # class of the surface or solid; 0 if the voxel is free or has no class
     instances: Ints32  # number of the object in `Scene.object_names`, or `FREE`
     observed: Bools  # whether a ray of the sweep passes through the voxel or ends in it
     hit: Bools  # whether a ray of the sweep hits a surface in the voxel
@@ -85,5 +85,5 @@ class Occupancy(NamedTuple):
 
     @property
     def occupied(self) -> Bools:
-        """Whether each voxel intersects a surface, or has its center in a closed one."""
+        """Whether each voxel intersects a surface, or has its center inside a closed surface."""
         return np.asarray(self.instances != FREE)

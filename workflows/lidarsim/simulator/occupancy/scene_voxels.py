@@ -32,10 +32,10 @@ class ClosedParts(NamedTuple):
 
     @classmethod
     def of_mesh(cls, vertices: Floats, faces: Integers, owners: Integers) -> ClosedParts:
-        """Find the components of a mesh in which each edge joins two faces of equal orientation.
+        """Find the components of a mesh in which each edge joins two consistently oriented faces.
 
-        Vertices with the same position and the same owner count as one. `owners` (f,) are the
-        objects of the faces.
+        Vertices with the same position and the same owner are merged. `owners` (f,) are the objects
+        of the faces.
         """
         from . import voxel_loops as loops  # imported here because numba is slow to import
 
@@ -52,7 +52,7 @@ class ClosedParts(NamedTuple):
 
 
 def _merged_corners(vertices: Floats, faces: Integers, owners: Integers) -> tuple[Ints, int]:
-    """Return the corners (f, 3) of faces as numbers of distinct vertices, and their number."""
+    """Return the corners (f, 3) of faces as indices of distinct vertices, and the vertex count."""
     object_of_vertex = np.zeros((len(vertices), 1))
     object_of_vertex[faces.ravel(), 0] = np.repeat(owners, 3)
     keys = np.concatenate([vertices + 0.0, object_of_vertex], axis=1)  # -0 becomes 0
@@ -62,9 +62,9 @@ def _merged_corners(vertices: Floats, faces: Integers, owners: Integers) -> tupl
 
 
 def _has_open_edge(corners: Ints, count: int) -> Bools:
-    """Return whether each face has an edge that does not join two faces of equal orientation.
+    """Return whether each face has an edge that does not join two consistently oriented faces.
 
-    `corners` (f, 3) are numbers below `count`.
+    `corners` (f, 3) are vertex indices below `count`.
     """
     if not len(corners):
         return np.zeros(0, np.bool_)
@@ -100,7 +100,7 @@ class SceneVoxels:
     def triangles(self, grid: VoxelGrid, pose: GridPose, time_ns: float) -> Ints32:
         """Return the triangle of each voxel at a time in nanoseconds, or -1 for none.
 
-        The shape is that of the grid. Surfaces have precedence over solids.
+        The shape is that of the grid. Surfaces take precedence over solids.
         """
         from . import voxel_loops as loops  # imported here because numba is slow to import
 
@@ -165,7 +165,7 @@ class SceneVoxels:
     def _closed_parts(
         self, vertices: Floats, faces: Integers, owners: Integers | None = None
     ) -> ClosedParts:
-        """Return the closed components of a mesh, which are determined once."""
+        """Return the closed components of a mesh, which are computed only once."""
         if id(faces) not in self._closed:
             owners = np.zeros(len(faces), np.int64) if owners is None else owners
             self._closed[id(faces)] = ClosedParts.of_mesh(vertices, faces, owners)

@@ -20,9 +20,9 @@ class OccupancySimulator:
 
     A voxel is occupied if a surface intersects it, or if its center is inside a closed surface. If
     several surfaces intersect a voxel, the one that is closest to its center determines its class
-    and its instance. Actors have their poses at the start of the sweep. A voxel is observed if the
-    central ray of a pulse of the sweep passes through it, or ends in it, between the minimum range
-    of the sensor and the first surface or, if there is none, the maximum range.
+    and its instance. Actors are placed at their poses at the start of the sweep. A voxel is
+    observed if the central ray of a pulse of the sweep passes through it, or ends in it, between
+    the minimum range of the sensor and the first surface or, if there is none, the maximum range.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from raybeam.compiled import compiled, inlined
 
 from .marks import HIT, TRAVERSED
 
-# A surface that touches a voxel within this distance intersects it, whatever the rounding errors.
+# A surface within this distance of a voxel intersects it, regardless of rounding errors.
 SLACK = 1e-6
 _HALF = 0.5 + SLACK
 
@@ -65,7 +65,7 @@ def _dot(p, q):
 
 @inlined
 def _step(p, q, t):
-    """Return the point at the fraction `t` of the way from `p` to `q`."""
+    """Return the linear interpolation between `p` and `q` at the fraction `t`."""
     return (p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1]), p[2] + t * (q[2] - p[2]))
 
 
@@ -105,19 +105,19 @@ def _square(a, b, c, n):
 
 @inlined
 def _first(low, limit):
-    """Return the first voxel along an axis that a surface from `low` on touches."""
+    """Return the first voxel along an axis that a surface with the lower bound `low` touches."""
     return max(math.ceil(max(low - 1 - SLACK, -1.0)), 0) if low < limit + 1 else limit
 
 
 @inlined
 def _last(high, limit):
-    """Return the last voxel along an axis that a surface up to `high` touches, or -1."""
+    """Return the last voxel along an axis that a surface up to `high` touches, or -1 for none."""
     return min(math.floor(min(high + SLACK, limit + 1.0)), limit - 1) if high > -1 else -1
 
 
 @compiled()
 def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compiled loop
-    """Set the triangle of each voxel that triangles intersect.
+    """Set the triangle of each voxel that a triangle intersects.
 
     `corners` (f, 3, 3) and `numbers` (f,) are triangles and their numbers. If several triangles
     intersect a voxel, `triangle` (x, y, z) receives the one that is closest to its center, and
@@ -129,7 +129,7 @@ def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compi
         e = (t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2])
         f = (t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2])
         n = (e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0])
-        main = 0  # axis along which the triangle's plane is steepest
+        main = 0  # dominant axis of the normal
         for axis in range(1, 3):
             if abs(n[axis]) > abs(n[main]):
                 main = axis
@@ -172,10 +172,10 @@ def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compi
 
 @inlined
 def _turns(t, x, y):
-    """Return how often a vertical line through (x, y) passes a triangle: -1, 0 or 1.
+    """Return the signed number of crossings of a triangle by a vertical line through (x, y).
 
-    The result is positive if the corners are in counterclockwise order. Triangles that share an
-    edge compute the same side for it, so a line through a closed surface always adds up to 0.
+    The result is -1, 0 or 1. It is positive if the corners are in counterclockwise order. Triangles
+    that share an edge classify the line consistently, so the sum over a closed surface is always 0.
     """
     turns = 0
     for edge in range(3):
@@ -197,7 +197,7 @@ def add_interior(corners, number, triangle):  # noqa: C901 - a compiled loop
     """Set the triangle of each voxel whose center is inside a closed surface.
 
     `corners` (f, 3, 3) are the triangles of the surface, with consistent orientation. Voxels that
-    already have a triangle do not change, others receive `number`.
+    already have a triangle do not change. The others receive `number`.
     """
     first = np.empty(3, np.int64)
     stop = np.empty(3, np.int64)
@@ -291,7 +291,7 @@ def add_rays(origins, directions, t_min, t_ends, hits, marks):  # noqa: C901 - a
 
 @compiled()
 def components_of(faces, count):
-    """Return the smallest vertex that is connected to each of `count` vertices by faces (f, 3)."""
+    """Return the smallest vertex that faces (f, 3) connect to each of `count` vertices."""
     parents = np.arange(count)
     for row in range(len(faces)):
         for corner in range(2):

@@ -69,7 +69,7 @@ class BatchPoints:
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.actor_rays = actor_rays  # how rays meet actors, of type `ACTOR_RAYS`
+        self.actor_rays = actor_rays  # visibility records of actors, of type `ACTOR_RAYS`
         self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan before thinning
         self._surfaces = surfaces
         self._pattern = pattern
@@ -151,7 +151,7 @@ class BatchPoints:
     def _sent_times_ns(self) -> Ints:
         """Time at which each return is sent, in nanoseconds since the start of the survey.
 
-        It differs from the firing time if a frozen sensor sends an old sweep again.
+        It differs from the firing time if a frozen sensor resends an old sweep.
         """
         spec = self.specs[0]
         if spec.repeats is None:
@@ -223,7 +223,7 @@ class BatchPoints:
         return self._moved_with_frozen_sensor(self._scene_positions)
 
     def _georeferenced(self, points: Floats) -> Floats:
-        """Move points of the scene frame to where the measured trajectory places them.
+        """Move points in the scene frame to their positions according to the measured trajectory.
 
         If the survey reports true positions, the points are returned unchanged.
         """
@@ -493,7 +493,7 @@ class BatchPoints:
 
         The displacements are in the frame of the survey's points. They are NaN for returns without
         a surface, for ghosts, for points without a next sweep, and for sweeps that a frozen sensor
-        sends again.
+        resends.
         """
         flow = SceneFlow(*np.full((2, len(self), 3), np.nan))
         if self.specs[0].repeats is not None:
