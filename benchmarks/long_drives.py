@@ -88,7 +88,7 @@ def simulate_period(model: str, columns: int) -> list[Sweep]:
     actors = []
     for period in range(-1, 3):
         start_m = _CAR_START_M + period * _PERIOD_M
-        # A period later, the car of this period is where the car of the next one was.
+        # A period later, the next car is where this one was, relative to the sensor.
         x_m = start_m + (_CAR_M_S * (times_s - period * _SWEEP_S * _PERIOD_SWEEPS))
         positions = np.stack([x_m, np.full(2, 3.0), np.zeros(2)], axis=1)
         actors.append(Actor(car(MODELS[0]), Track(times_s, positions, oncoming)))

@@ -277,11 +277,7 @@ def augment(
     """  # noqa: D301 - Click requires the character \b
     if resume and overwrite:
         raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
-    if workers is not None and scheduler is not None:
-        raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
-            "workers of the cluster."
-        )
+    options.check_workers(workers, scheduler)
     if partial and sensor is None:
         raise click.UsageError("`--partial` requires `--sensor`.")
     if not isinstance(out, Path):

@@ -61,11 +61,7 @@ def mount(
       lidarpool mount vehicle.yaml --out mounts --overwrite
       lidarpool mount vehicle.yaml --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - Click requires the character \b
-    if workers is not None and scheduler is not None:
-        raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
-            "workers of the cluster."
-        )
+    options.check_workers(workers, scheduler)
     print_first_step("reading the vehicle", quiet=as_json)
     from ..clouds.folder import result_folder
     from ..mounting.study import MountStudy, figures_of

@@ -122,11 +122,7 @@ def occupancy(
       lidarpool occupancy street.yaml --layout semantickitti --following 10 --out street/kitti
       lidarpool occupancy campaign.yaml --layout occ3d --out grids --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - Click requires the character \b
-    if workers is not None and scheduler is not None:
-        raise click.UsageError(
-            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
-            "workers of the cluster."
-        )
+    options.check_workers(workers, scheduler)
     print_first_step("reading the scene", quiet=quiet or as_json)
     from lidarsim.simulator.occupancy import VoxelGrid
 

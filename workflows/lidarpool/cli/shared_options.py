@@ -215,6 +215,15 @@ workers = click.option(
 )
 
 
+def check_workers(workers: int | None, scheduler: str | None) -> None:
+    """Raise UsageError if both a number of processes and a scheduler are specified."""
+    if workers is not None and scheduler is not None:
+        raise click.UsageError(
+            "`--workers` and `--scheduler` cannot be combined, because `--scheduler` uses the "
+            "workers of the cluster."
+        )
+
+
 def scheduler(command: Command) -> Command:
     """Add the options for connecting to a running scheduler.
 

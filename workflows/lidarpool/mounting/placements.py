@@ -223,7 +223,7 @@ def pack_sweeps(
 
 
 def _beam_offset_m(sensor: Sensor) -> float:
-    """Return the largest horizontal distance of a beam's start from the sensor's origin."""
+    """Return the largest distance between a beam's start and the sensor's origin in a firing."""
     origins = sensor.origins(np.arange(1))
     return 0.0 if origins is None else float(np.linalg.norm(origins.reshape(-1, 3), axis=1).max())
 

@@ -1,8 +1,8 @@
 """Enumeration and search of candidates.
 
-For given mounts, all combinations are evaluated. Mounts in ranges are searched. The sensors are
-placed one after another, each at the best of several random mounts, and then moved in small steps
-as long as the score increases.
+For given mounts, all combinations that the vehicle file allows are evaluated. Mounts in ranges are
+searched. The sensors are placed one after another, each at the best of several random mounts, and
+then moved in small steps as long as the score increases.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from .flight_area import GEOGRAPHIC, transform_shape
 
 _KML = "http://www.opengis.net/kml/2.2"
 _COLORS = {"area": "ff9a6a35", "line": "ff2d18e0", "cross": "ff3377ee", "path": "ff76685d"}  # ABGR
-_PATH_POINTS = 2000  # maximum number of points of the path in a file
+_PATH_POINTS = 2000  # approximate limit of the points of the path in a file
 
 
 class _Feature(NamedTuple):

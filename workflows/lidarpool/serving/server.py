@@ -38,7 +38,7 @@ class Endpoint(NamedTuple):
         Parameters
         ----------
         listen
-            Address and port. The default is a free port on 127.0.0.1.
+            Address and port. The default is port 50051 on 127.0.0.1, or the next free port.
         token_file
             File with the token. Without a token, only clients on this machine can connect.
 

@@ -81,7 +81,6 @@ def _limb(ends: Floats, half_width: float) -> Solid:
     side = np.cross(along, [0.0, 1.0, 0.0] if abs(along[1]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     axes = np.stack([np.cross(side, along), side, along])
-    axes[0] = np.cross(axes[1], axes[2])
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half_width
     bar = loft(corners, [(0, 0), (length, 0)])
     return Solid(bar.vertices @ axes + ends[0], bar.faces)

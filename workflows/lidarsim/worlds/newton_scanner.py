@@ -14,6 +14,7 @@ from ..errors import LidarError
 from ..numerics.arrays import Floats, Floats32, Indices
 from ..numerics.vectors import matmul
 from ..scene.object_names import unique_names
+from ..schema.checks import check_choice
 from ..sensor import Sensor
 from ..survey.survey import Mounted
 from .follower import Follower
@@ -119,9 +120,9 @@ class NewtonScanner:
                 "Set either the body or the site of the lidar, with body=LABEL or site=LABEL, but "
                 "not both."
             )
-        _check_choice("worlds", worlds, ("own", "all"))
-        _check_choice("geometry", geometry, ("visual", "collision"))
-        _check_choice("objects", objects, ("body", "shape"))
+        check_choice("worlds", worlds, ("own", "all"))
+        check_choice("geometry", geometry, ("visual", "collision"))
+        check_choice("objects", objects, ("body", "shape"))
         if not sag_m > 0:
             raise LidarError(f"sag_m must be greater than 0, but is {sag_m}.")
         arrays = NewtonModel.from_model(model)
@@ -384,9 +385,3 @@ def _seconds(time_s: Any) -> float:
 
 def _is_index(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        listed = " or ".join(repr(choice) for choice in choices)
-        raise LidarError(f"{name} must be {listed}, but is {value!r}.")

@@ -58,11 +58,12 @@ def compare_surveys(
     b
         Cloud, or mesh file.
     method
-        ``pairs`` compares points of the same ray and the same return, which requires a column
-        `time` or `gps_time` in both clouds. ``planes`` computes distances of the points of A from
-        planes through the points of B, ``m3c2`` computes M3C2 distances and their level of
-        detection with py4dgeo, and ``mesh`` computes signed distances from a mesh. ``auto`` selects
-        ``mesh`` if B is a mesh, otherwise ``pairs`` if points can be paired, otherwise ``planes``.
+        ``pairs`` compares points of the same ray and the same return, which requires the
+        column `time` or `gps_time`, or the columns `scan` and `ray`, in both clouds. ``planes``
+        computes distances of the points of A from planes through the points of B, ``m3c2`` computes
+        M3C2 distances and their level of detection with py4dgeo, and ``mesh`` computes signed
+        distances from a mesh. ``auto`` selects ``mesh`` if B is a mesh, otherwise ``pairs`` if
+        points can be paired, otherwise ``planes``.
     sensor_a, sensor_b
         Name of the sensor to compare (default: all sensors).
     unit_a, unit_b

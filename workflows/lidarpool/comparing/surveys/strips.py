@@ -242,7 +242,7 @@ class _Overlap(NamedTuple):
     cells: Ints  # (n, 2): column and row
     first: Ints  # (n,): number of the first strip
     second: Ints  # (n,)
-    rough: int  # number of cells that are not compared because they are too rough
+    rough: int  # number of comparisons, by cell and pair, that are omitted because of roughness
 
 
 def _cell_planes(cells: _CellSums, settings: StripSettings) -> _CellPlanes:

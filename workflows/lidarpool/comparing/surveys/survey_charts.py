@@ -175,7 +175,7 @@ def _name_axes(axes: Axes, *, with_north: bool) -> None:
 def draw_histograms(
     figures: Mapping[str, Any], components: Mapping[str, Floats], labels: Mapping[str, str]
 ) -> Page:
-    """Draw a histogram of each component, with its mean and its central 95 %."""
+    """Plot a histogram of each component, with its mean and absolute 95th percentile."""
     names = [name for name in components if name != "horizontal"]
     page = Page((_WIDTH, 620))
     page.title("Distribution of deviations", "A − B; lines show the mean and ± 95 %")

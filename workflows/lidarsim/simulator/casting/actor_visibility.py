@@ -20,10 +20,11 @@ from ...columns.actor_rays import ACTOR_RAYS
 from ...motion.trajectory import full_poses, presence_ns
 from ...numerics.arrays import Bools, Floats, Indices, Ints, Records
 from ...numerics.elementary import arctan2
-from ...numerics.vectors import hypot, matmul, matvec, norm, rotate
+from ...numerics.vectors import hypot, matvec, norm, rotate
 from ...scene.scene import Scene
 from ...sensor import Sensor
 from ...survey.survey import ScanSpec, Survey
+from ...survey.sweep_poses import sensor_pose
 from .motion import CastPoses
 from .ray_chunks import RayChunk, ray_chunks
 from .scene_caster import NEVER_NS, SceneCaster
@@ -250,21 +251,10 @@ class ActorVisibility:
         """Return the fraction of each box's cells that are outside the field of view."""
         steps = (np.arange(_CELLS) + 0.5) / _CELLS * 2 - 1
         cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-        position, axes = self._sensor_pose(sweep)
+        position, axes = sensor_pose(self._survey, self._number, sweep)
         truncations = np.empty(len(boxes.centers))
         for row, half in enumerate(boxes.halves):
             in_scene = rotate(cells * half, boxes.rotations[row]) + boxes.centers[row]
             inside = self._field_of_view.contains(rotate(in_scene - position, axes.T))
             truncations[row] = 1.0 - np.count_nonzero(inside) / len(inside)
         return truncations
-
-    def _sensor_pose(self, sweep: int) -> tuple[Floats, Floats]:
-        """Return the position (3,) and rotation (3, 3) of the sensor at the start of a sweep."""
-        survey = self._survey
-        sweeps = survey.sweeps_each[self._number]
-        station = sweep // (len(sweeps.firsts) // survey.path.stations)
-        mount = survey.mounted_sensors[self._number].mount
-        since_ns = sweeps.starts_ns[[sweep]] - station * survey.station_ns
-        positions, rotations = full_poses(survey.path, station, since_ns)
-        position = positions[0] + matvec(rotations[0], np.array(mount.position))
-        return position, matmul(rotations[0], mount.rotation_matrix)

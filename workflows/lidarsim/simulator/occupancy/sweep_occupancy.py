@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...motion.trajectory import full_poses
 from ...numerics.arrays import Bytes, to_writable
-from ...numerics.vectors import matmul, matvec, rotate
+from ...numerics.vectors import rotate
 from ...scene.scene import Scene
 from ...survey.survey import Survey
+from ...survey.sweep_poses import platform_pose, sensor_pose
 from ..rig import CentralRays, Rig
 from .grid import FREE, GridFrame, Occupancy, VoxelGrid
 from .marks import HIT
@@ -117,13 +117,5 @@ class OccupancySimulator:
 
     def _grid_pose(self, number: int) -> GridPose:
         """Return the pose of the platform or of the sensor at the start of a sweep."""
-        survey = self._survey
-        sweeps = survey.sweeps_each[self._sensor]
-        station = number // (len(sweeps.firsts) // survey.path.stations)
-        since_ns = sweeps.starts_ns[[number]] - station * survey.station_ns
-        positions, rotations = full_poses(survey.path, station, since_ns)
-        if self._frame == "platform":
-            return GridPose(positions[0], rotations[0])
-        mount = survey.mounted_sensors[self._sensor].mount
-        position = positions[0] + matvec(rotations[0], np.array(mount.position))
-        return GridPose(position, matmul(rotations[0], mount.rotation_matrix))
+        find = platform_pose if self._frame == "platform" else sensor_pose
+        return GridPose(*find(self._survey, self._sensor, number))
