@@ -1,4 +1,4 @@
-"""Print test durations in seconds as JSON, given a JUnit report of pytest.
+"""Print test durations in seconds as JSON, given a JUnit report from pytest.
 
 The duration of a test with several parameter sets is their mean. Tests below a tenth of a second
 are omitted. `tests/conftest.py` starts the longest files first, so that no process runs a long file

@@ -202,7 +202,7 @@ def cost_of(work: Callable[[int], object], count: int, scheduler: psutil.Process
 
 
 def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str, float]:
-    """Return the median costs per item of both sides in microseconds, and their median ratios."""
+    """Return the median costs per item in microseconds, and their median ratios."""
     work.ours(min(count, 50))  # both have done everything once
     work.theirs(min(count, 50))
     calls = {

@@ -47,7 +47,7 @@ class DeformingMesh:
 
     @property
     def box(self) -> Floats:
-        """Lower and upper corner of a bounding box around all frames, in meters. Shape (2, 3)."""
+        """Lower and upper corners of a bounding box around all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:

@@ -44,7 +44,7 @@ class WorkerMove:
 
 @dataclass(frozen=True)
 class DemandStats:
-    """Load of a partition in a balanced group, averaged over about six running times of a task.
+    """Load of a partition in a balanced group, averaged over about six task durations.
 
     Parameters
     ----------

@@ -186,7 +186,9 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
     bare = written(tmp_path / "b.las", ground("EPSG:3857"))
     np.savetxt(tmp_path / "b.xyz", ground("EPSG:3857"))
     for file in (bare, tmp_path / "b.xyz"):
-        with pytest.raises(LidarError, match=r"states no coordinate system.*Remove --epsg"):
+        with pytest.raises(
+            LidarError, match=r"does not specify a coordinate system.*Remove --epsg"
+        ):
             scene_from_points(file, epsg=32632)
 
 

@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch):
     [
         (("--overlap", "99%"), "'99%' is not a valid overlap. Expected a value from 0% to 95%"),
         (("--overlap", "0.99"), "'0.99' is not a valid overlap. Expected a value from 0% to 95%"),
-        (("--speed", "12-4"), "the lower limit comes first. Use `--speed 4-12`"),
+        (("--speed", "12-4"), "the lower limit must come first. Use `--speed 4-12`"),
         (("--speed", "0-4"), "'0-4' is not a valid speed. Expected a speed from 0.1 to 400"),
         pytest.param(
             ("--unit", "mm"),

@@ -315,8 +315,7 @@ def _select(rays: _Rays, candidates: CandidateRings, chosen: Bools) -> tuple[_Ra
 
 def _matched_rays(pulses: RingDirections, sensor: Sensor) -> tuple[_Rays, CandidateRings]:
     """Match the rays of the first revolution of a sensor with recorded rings."""
-    steps = sensor.steps_of_revolution(0)
-    firings = np.arange(sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1])
+    firings = np.array(sensor.firings_of_revolution(0))
     directions = sensor.directions(firings)
     limits_rad = _channel_limits(sensor)
     rays = []

@@ -199,7 +199,7 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     print_first_step("reading the area", quiet=as_json)
     from lidarsim.schema.model_names import full_name
 
-    from ..clouds.folder import result_folder
+    from ..clouds.folder import check_not_existing, result_folder
     from ..plan.flight import plan_flight
     from ..plan.flight_scanner import AirborneScanner
     from .terminal import Terminal
@@ -211,12 +211,7 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     folder = settings.pop("out") or Path(f"{site.name}-flight")
     overwrites = settings.pop("overwrite")
     with result_folder(folder):
-        existing = [folder / name for name in FILES if (folder / name).exists()]
-        if existing and not overwrites:
-            raise LidarError(
-                f"{existing[0]} already exists. Use another folder with `--out`, or pass "
-                "`--overwrite`."
-            )
+        check_not_existing((folder / name for name in FILES), overwrite=overwrites)
         with terminal.status("planning the flight lines"):
             plan = plan_flight(site.shape, site.terrain, scanner, **settings)
         density = _write_plan(plan, site, folder, terminal)
@@ -235,7 +230,7 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
 
 
 class _Site(NamedTuple):
-    """Area and ground of a flight plan."""
+    """Area to survey and its terrain."""
 
     name: str
     shape: Any  # Shapely polygon in scenario coordinates

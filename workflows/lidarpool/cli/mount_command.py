@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lidarsim.errors import LidarError
 from lidarsim.words import plural, printable
 
 from . import shared_options as options
@@ -63,7 +62,7 @@ def mount(
     """  # noqa: D301 - Click requires the character \b
     options.check_workers(workers, scheduler)
     print_first_step("reading the vehicle", quiet=as_json)
-    from ..clouds.folder import result_folder
+    from ..clouds.folder import check_not_existing, result_folder
     from ..mounting.study import MountStudy, figures_of
     from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, write_study
     from ..processes.fork_server import keep_freed_memory
@@ -76,11 +75,7 @@ def mount(
     study = MountStudy.from_file(VehicleFile.load(vehicle))
     folder = Path(f"{vehicle.stem}-mounts") if out is None else out
     with result_folder(folder):
-        if (folder / FIGURES_FILE).exists() and not overwrite:
-            raise LidarError(
-                f"{folder / FIGURES_FILE} already exists. Use another folder with `--out`, or pass "
-                "`--overwrite`."
-            )
+        check_not_existing([folder / FIGURES_FILE], overwrite=overwrite)
         client = nullcontext() if scheduler is None else connect_client(scheduler, files)
         with client as connected, terminal.status("simulating the sensors at all mounts"):
             result = study.run(client=connected, workers=workers)

@@ -160,7 +160,7 @@ def stations(
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
     print_first_step("reading the scene", quiet=settings["as_json"])
-    from ..clouds.folder import result_folder
+    from ..clouds.folder import check_not_existing, result_folder
     from ..scenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
@@ -182,13 +182,8 @@ def stations(
         overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
         with result_folder(folder):
-            files = [folder / name for name in (PLAN_FILE, PICTURE_FILE)]
-            existing = [file for file in files if file.exists()]
-            if existing and not overwrites:
-                raise LidarError(
-                    f"{existing[0]} already exists. Use another folder with `--out`, or pass "
-                    "`--overwrite`."
-                )
+            files = (folder / name for name in (PLAN_FILE, PICTURE_FILE))
+            check_not_existing(files, overwrite=overwrites)
             _plan(scenario, model, folder, **settings)
 
 

@@ -11,7 +11,7 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,6 +27,15 @@ def output_destination(text: str | Path) -> Path | Storage:
     It is remote storage if the text is a URL.
     """
     return Storage.at(text) if is_url(text) else Path(text)
+
+
+def check_not_existing(files: Iterable[Path], *, overwrite: bool) -> None:
+    """Raise LidarError if one of the files exists and must not be overwritten."""
+    existing = next((file for file in files if file.exists()), None)
+    if existing is not None and not overwrite:
+        raise LidarError(
+            f"{existing} already exists. Use another folder with `--out`, or pass `--overwrite`."
+        )
 
 
 @contextmanager

@@ -196,7 +196,7 @@ class FollowedSensor:
             self._sweeps = Sweeps.from_survey(scanner.survey, scanner.scene.with_actors(()))
         sensor = self._own.sensor
         steps = sensor.steps_of_revolution(number)
-        firings = np.array([sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1] - 1])
+        firings = np.array(sensor.firings_of_revolution(number))[[0, -1]]
         begin_ns, end_ns = (sensor.begins_ns(firings) + sensor.lead_ns).tolist()
         fired = self._sweeps.fired
         return replace(

@@ -308,7 +308,7 @@ def _with_contact(mounted: Mounted) -> Mounted:
 def _beams(mounted: Mounted) -> BeamSegments:
     """Return all beams of the first revolution in the vehicle frame. The segments are empty."""
     sensor, mount = mounted.sensor, mounted.mount
-    firings = _first_revolution(sensor)
+    firings = np.array(sensor.firings_of_revolution(0))
     directions = rotate(sensor.directions(firings).reshape(-1, 3), mount.rotation)
     origins = sensor.origins(firings)
     offsets = np.zeros_like(directions)
@@ -323,16 +323,10 @@ def _beams(mounted: Mounted) -> BeamSegments:
     )
 
 
-def _first_revolution(sensor: Sensor) -> Ints:
-    """Return the numbers of the firings in the first revolution or frame."""
-    steps = sensor.steps_of_revolution(0)
-    start, stop = sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1]
-    return np.arange(start, stop, dtype=np.int64)
-
-
 def _blocked_share(sensor: Sensor, blocked: Bools) -> Floats32:
     """Return the share of blocked beams by azimuth and elevation in the sensor frame."""
-    x, y, z = sensor.directions(_first_revolution(sensor)).reshape(-1, 3).T
+    firings = np.array(sensor.firings_of_revolution(0))
+    x, y, z = sensor.directions(firings).reshape(-1, 3).T
     columns, rows = round(360 / SHARE_DEG), round(180 / SHARE_DEG)
     column = ((np.degrees(np.arctan2(y, x)) + 180) / SHARE_DEG).astype(int) % columns
     elevation = np.degrees(np.arcsin(np.clip(z, -1, 1))) + 90

@@ -1,4 +1,4 @@
-"""Layouts of occupancy grids: files of Occ3D-nuScenes and SemanticKITTI."""
+"""File layouts of occupancy grids in Occ3D-nuScenes and SemanticKITTI."""
 
 from __future__ import annotations
 

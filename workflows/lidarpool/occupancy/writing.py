@@ -19,6 +19,7 @@ from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGri
 from lidarsim.words import join_names
 
 from ..clouds.cloud_format import Entry
+from ..clouds.folder import check_not_existing
 from ..run.cluster.worker_map import parallel_map
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_file import is_campaign
@@ -222,8 +223,8 @@ def write_occupancy(
     for number in numbers:
         layout = _open_job(path, number, settings).layout
         notes |= dict.fromkeys(layout.notes())
-        if not overwrite:
-            _check_missing(out, layout)
+        names = (name for sample in range(layout.count) for name in layout.paths(sample))
+        check_not_existing((out / name for name in names), overwrite=overwrite)
         tasks += [
             _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
             for first in range(0, layout.count, _TASK_SWEEPS)
@@ -259,17 +260,6 @@ def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
             f"Job {job} does not exist. The jobs of the campaign are 0 to {len(numbers) - 1}."
         )
     return [job]
-
-
-def _check_missing(out: Path, layout: GridLayout) -> None:
-    """Raise LidarError if a file of the layout exists."""
-    for number in range(layout.count):
-        for name in layout.paths(number):
-            if (out / name).exists():
-                raise LidarError(
-                    f"{out / name} already exists. Use another folder with `--out`, or pass "
-                    "`--overwrite`."
-                )
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.motion.trajectory import full_poses
+from lidarsim.motion.trajectory import mounted_poses
 from lidarsim.numerics.arrays import Bools, Floats, Ints
-from lidarsim.numerics.vectors import matmul, rotate_into_frames
+from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.survey.survey import Mounted, Survey
@@ -186,12 +186,10 @@ def _sampled_hits(
     """Return the points that one in `every` rays of a sensor hits, in local coordinates."""
     sensor = mounted.sensor
     rays = sensor.firings(steps - 1)[1] * sensor.channels
-    # Multiples of the golden ratio spread the rays evenly over firings and channels.
-    number = np.arange(rays // every, dtype=np.int64)
-    ray = number * every + (number * _GOLDEN % 1 * every).astype(np.int64)
-    firing, channel = np.divmod(ray, sensor.channels)
+    firing, channel = np.divmod(_sampled_numbers(rays, every), sensor.channels)
     fired, row = np.unique(firing, return_inverse=True)
-    origins, rotations = _sensor_poses(survey, mounted, fired)
+    times_ns = np.minimum(sensor.begins_ns(fired) + sensor.lead_ns, survey.path.duration_ns)
+    origins, rotations = mounted_poses(survey.path, 0, mounted.mount, times_ns)
     directions = sensor.directions(fired)[row, channel]
     towards = rotate_into_frames(directions, rotations.transpose(0, 2, 1)[row])
     found = caster.cast(origins[row], towards)
@@ -200,14 +198,11 @@ def _sampled_hits(
     return np.asarray(origins[row[hit]] + found.distance[hit, None] * towards[hit])
 
 
-def _sensor_poses(survey: Survey, mounted: Mounted, firings: Ints) -> tuple[Floats, Floats]:
-    """Return the positions and rotations of a sensor at firings of shape (k,)."""
-    sensor = mounted.sensor
-    times_ns = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, survey.path.duration_ns)
-    positions, rotations = full_poses(survey.path, 0, times_ns)
-    levers = np.broadcast_to(np.array(mounted.mount.position), positions.shape)
-    origins = positions + rotate_into_frames(levers, rotations.transpose(0, 2, 1))
-    return origins, matmul(rotations, mounted.mount.rotation_matrix)
+def _sampled_numbers(rays: int, every: int) -> Ints:
+    """Return the numbers of one in `every` rays, spread evenly over firings and channels."""
+    number = np.arange(rays // every, dtype=np.int64)
+    # Multiples of the golden ratio modulo 1 are evenly distributed.
+    return number * every + (number * _GOLDEN % 1 * every).astype(np.int64)
 
 
 def _count_in_area(points: Floats, weight: float, area: Sequence[Ring]) -> DensityMap:

@@ -82,7 +82,7 @@ class AirborneScanner:
         _check_field(sensor, widest_deg, fov_deg)
         planned_deg = min(widest_deg, WIDE_FOV_DEG) if fov_deg is None else fov_deg
         within = across_deg <= planned_deg / 2 + 1e-6
-        fired_hz = _pulse_rate_hz(sensor)
+        fired_hz = sensor.pulse_rate_hz
         mirror = sensor.head if isinstance(sensor.head, Mirror) else None
         oscillates = mirror is not None and mirror.motion != "sawtooth"
         limits = (content.rate_hz, content.rate_hz)
@@ -111,25 +111,12 @@ class AirborneScanner:
         return 2 * height_m * self.tangent
 
 
-def _cycle_firings(sensor: Sensor) -> tuple[int, int]:
-    """Return the first firing in a cycle of a sensor, and one past the last."""
-    steps = sensor.steps_of_revolution(0)
-    return sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1]
-
-
 def _cycle_directions(sensor: Sensor, mount: Pose) -> Floats:
     """Return the directions of pulses in a cycle in the aircraft frame, with shape (3, n)."""
-    first, stop = _cycle_firings(sensor)
-    count = min(stop - first, max(1, _SAMPLED_PULSES // sensor.channels))
-    firings = np.linspace(first, stop, count, endpoint=False).astype(np.int64)
+    cycle = sensor.firings_of_revolution(0)
+    count = min(len(cycle), max(1, _SAMPLED_PULSES // sensor.channels))
+    firings = np.linspace(cycle.start, cycle.stop, count, endpoint=False).astype(np.int64)
     return rotate(sensor.directions(firings).reshape(-1, 3), mount.rotation).T
-
-
-def _pulse_rate_hz(sensor: Sensor) -> float:
-    """Return the number of pulses per second, averaged over a cycle."""
-    first, stop = _cycle_firings(sensor)
-    cycle_s = (sensor.revolution_start_ns(1) - sensor.revolution_start_ns(0)) / 1e9
-    return float((stop - first) * sensor.channels / cycle_s)
 
 
 def _check_field(sensor: Sensor, widest_deg: float, fov_deg: float | None) -> None:

@@ -1,4 +1,4 @@
-"""Interface of bridges, which play sweeps in the protocol selected with `--as`."""
+"""Interface of bridges, which publish sweeps with the protocol selected by `--as`."""
 
 from __future__ import annotations
 

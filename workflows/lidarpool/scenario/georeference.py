@@ -40,7 +40,7 @@ def check_epsg(epsg: int, scene: Scene) -> None:
 
 
 def location_warning(scene: Scene, epsg: int | None) -> str:
-    """Return a warning if a scene is probably at a wrong location, or an empty string.
+    """Return a warning if a scene is probably in the wrong location, or an empty string.
 
     The location is probably wrong if it is far outside the area of use of the coordinate system, or
     if `world.origin` was added to coordinates that are already world coordinates.

@@ -105,7 +105,7 @@ class Job:
 
     @cached_property
     def location_warning(self) -> str:
-        """Warning that the scene is probably at a wrong location, or an empty string."""
+        """Warning that the scene is probably in the wrong location, or an empty string."""
         return location_warning(self.scene, self.survey.epsg)
 
     def with_fields(self, **fields: Any) -> Self:

@@ -244,7 +244,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
 def _file_crs(entry: MeshFile, objects: Objects) -> FileCrs | None:
     """Return the coordinate system that a file states for its x and y coordinates.
 
-    Return None if the file states no coordinate system, or if x and y are transformed.
+    Return None if the file does not specify a coordinate system, or if x and y are transformed.
     """
     if not entry.transform().keeps_xy:
         return None

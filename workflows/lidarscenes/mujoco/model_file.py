@@ -199,7 +199,7 @@ def _choice(
     seen = np.array(visible_geoms(model, choice), np.int64)
     if len(seen) > MAX_NODES:
         raise MeshFileError(
-            f"has {len(seen):,} geoms, and the limit is {MAX_NODES:,}. Divide the model"
+            f"has {len(seen):,} geoms, and the limit is {MAX_NODES:,}. Split the model"
         )
     return choice._replace(sag_m=_sag_m(model, seen))
 

@@ -76,7 +76,7 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
 def _count(count: int) -> None:
     """Raise MeshFileError if a model refers to too many files."""
     if count > _MAX_FILES:
-        raise MeshFileError(f"refers to more than {_MAX_FILES:,} files. Divide the model")
+        raise MeshFileError(f"refers to more than {_MAX_FILES:,} files. Split the model")
 
 
 def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:

@@ -24,7 +24,7 @@ _ZERO = 1e-9  # smaller numbers are rounding errors
 
 
 class Lidar(NamedTuple):
-    """A lidar in the world of another program.
+    """A lidar in a world file of another simulator.
 
     Attributes
     ----------

@@ -230,6 +230,32 @@ def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
     return positions, rotations
 
 
+def mounted_poses(
+    path: Trajectory, station: int, mount: Pose, times_ns: Floats
+) -> tuple[Floats, Floats]:
+    """Return the poses of an instrument that is mounted on a platform.
+
+    Parameters
+    ----------
+    path
+        Trajectory of the platform.
+    station
+        Number of the station.
+    mount
+        Pose of the instrument in the platform frame.
+    times_ns
+        Times since the start of the station in nanoseconds, with shape (k,).
+
+    Returns
+    -------
+    tuple of arrays
+        Positions (k, 3) in meters and rotation matrices (k, 3, 3), in the scene frame.
+    """
+    positions, rotations = full_poses(path, station, times_ns)
+    lever_arms = matvec(rotations, mount.position)
+    return positions + lever_arms, matmul(rotations, mount.rotation_matrix)
+
+
 def check_trajectory_type(name: str, value: object) -> None:
     """Check that an argument is a trajectory and not, for example, the path of a file.
 

@@ -138,15 +138,11 @@ class Sensor:
         }
         return html_table(rows.items()) + html_picture(self)
 
-    def _revolution_firings(self) -> tuple[int, int]:
-        """Return the half-open range of firing numbers in the first revolution or frame."""
-        steps = self.steps_of_revolution(0)
-        return self.firings(steps[0])[0], self.firings(steps[-1])[1]
-
     def _field_of_view(self) -> str:
         """Format the horizontal and vertical field of view, estimated from a sample of the rays."""
-        first, stop = self._revolution_firings()
-        firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
+        all_firings = self.firings_of_revolution(0)
+        samples = min(len(all_firings), SAMPLED_FIRINGS)
+        firings = np.linspace(all_firings[0], all_firings[-1], samples).astype(np.int64)
         x, y, z = self.directions(firings).reshape(-1, 3).T
         azimuths = np.sort(np.degrees(arctan2(y, x)))
         # The field of view is the full circle except for the widest gap between adjacent azimuths.
@@ -157,10 +153,8 @@ class Sensor:
 
     def _rate(self) -> str:
         """Format the revolution or frame rate and the number of rays per second."""
-        first, stop = self._revolution_firings()
         seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
-        rays = (stop - first) * self.channels / seconds
-        return f"{format_rounded(1 / seconds, 4)} Hz, {rays:,.0f} rays/s"
+        return f"{format_rounded(1 / seconds, 4)} Hz, {self.pulse_rate_hz:,.0f} rays/s"
 
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
@@ -311,6 +305,17 @@ class Sensor:
         """
         first = self._first_step(number, self._steps_in_revolution)
         return range(first, self._first_step(number + 1, self._steps_in_revolution))
+
+    @property
+    def pulse_rate_hz(self) -> float:
+        """Number of rays per second, averaged over the first revolution or frame."""
+        pulses = len(self.firings_of_revolution(0)) * self.channels
+        return pulses / ((self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9)
+
+    def firings_of_revolution(self, number: int) -> range:
+        """Return the range of firing numbers in a revolution or frame."""
+        steps = self.steps_of_revolution(number)
+        return range(self.firings(steps[0])[0], self.firings(steps[-1])[1])
 
     @cached_property
     def _steps_in_revolution(self) -> int:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from ..motion.trajectory import full_poses
+from ..motion.trajectory import CENTER, Pose, mounted_poses
 from ..numerics.arrays import Floats
-from ..numerics.vectors import matmul, matvec
 from .survey import Survey
 
 
@@ -25,16 +22,19 @@ def platform_pose(survey: Survey, sensor: int, sweep: int) -> tuple[Floats, Floa
     tuple of arrays
         Position (3,) in meters and rotation matrix (3, 3), in the scene frame.
     """
-    sweeps = survey.sweeps_each[sensor]
-    station = sweep // (len(sweeps.firsts) // survey.path.stations)
-    since_ns = sweeps.starts_ns[[sweep]] - station * survey.station_ns
-    positions, rotations = full_poses(survey.path, station, since_ns)
-    return positions[0], rotations[0]
+    return _pose_at_start(survey, sensor, sweep, CENTER)
 
 
 def sensor_pose(survey: Survey, sensor: int, sweep: int) -> tuple[Floats, Floats]:
     """Return the pose of the sensor at the start of a sweep, as `platform_pose` does."""
-    position, rotation = platform_pose(survey, sensor, sweep)
     mount = survey.mounted_sensors[sensor].mount
-    position = position + matvec(rotation, np.array(mount.position))
-    return position, matmul(rotation, mount.rotation_matrix)
+    return _pose_at_start(survey, sensor, sweep, mount)
+
+
+def _pose_at_start(survey: Survey, sensor: int, sweep: int, mount: Pose) -> tuple[Floats, Floats]:
+    """Return the pose of an instrument on the platform at the start of a sweep."""
+    sweeps = survey.sweeps_each[sensor]
+    station = sweep // (len(sweeps.firsts) // survey.path.stations)
+    since_ns = sweeps.starts_ns[[sweep]] - station * survey.station_ns
+    positions, rotations = mounted_poses(survey.path, station, mount, since_ns)
+    return positions[0], rotations[0]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..motion.rotations import matrices, quaternions_of
-from ..motion.trajectory import Pose, Trajectory, full_poses
+from ..motion.trajectory import Pose, Trajectory, mounted_poses
 from ..numerics.arrays import Floats, Floats32, Ints
 from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
@@ -251,10 +251,9 @@ def _relative_poses(
     frozen, the sweep was measured earlier with a different rotation.
     """
     flat = np.minimum(times_ns.ravel(), path.duration_ns)
-    positions, rotations = full_poses(path, station, flat)
-    shape = times_ns.shape
-    positions = (positions + rotations @ np.array(mount.position)).reshape(*shape, 3)
-    rotations = (rotations @ mount.rotation_matrix).reshape(*shape, 3, 3)
+    positions, rotations = mounted_poses(path, station, mount, flat)
+    positions = positions.reshape(*times_ns.shape, 3)
+    rotations = rotations.reshape(*times_ns.shape, 3, 3)
     starts = rotations[:, :1]
     # The displacements are first converted to the sensor frame at the start of the measured sweep,
     # and then from the sensor frame at the start of the sent sweep to the world frame.

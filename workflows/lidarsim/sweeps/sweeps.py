@@ -19,7 +19,7 @@ from ..columns.table import FLOW, FLOW_EGO, NORMAL, ORIGIN, TABLE
 from ..errors import LidarError
 from ..io.archives import open_archive, pack_arrays
 from ..motion.rotations import matrices, quaternions_of
-from ..motion.trajectory import full_poses
+from ..motion.trajectory import mounted_poses
 from ..numerics.arrays import (
     AnyArray,
     AnyFloats,
@@ -812,9 +812,9 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     positions = []
     rotations = []
     for station in range(path.stations):
-        platform_positions, platform_rotations = full_poses(path, station, times)
-        positions.append(platform_positions + platform_rotations @ np.array(mount.position))
-        rotations.append(platform_rotations @ mount.rotation_matrix)
+        station_positions, station_rotations = mounted_poses(path, station, mount, times)
+        positions.append(station_positions)
+        rotations.append(station_rotations)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
     # While a sensor is frozen, it repeats scans that were simulated earlier.
     cast_scans = np.array([spec.scan + spec.random_offset for spec in specs])

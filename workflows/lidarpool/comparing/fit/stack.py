@@ -75,7 +75,7 @@ class SweepStack:
 
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep] | None = None) -> SweepStack:
-        """Read the sweeps of a recording into common cells.
+        """Read the sweeps of a recording and group their points by cell.
 
         `read` is a function that reads the returns of a sweep by its index. The default is
         `compared_sweep`. Raises LidarError if the recording has no sweeps with points and rings, or

@@ -38,7 +38,7 @@ class Speed(NamedTuple):
 
 
 def read_static(recording: Recording, *, is_stationary: bool = False) -> SweepStack:
-    """Read the sweeps of a stationary sensor into common cells.
+    """Read the sweeps of a stationary sensor and group their points by cell.
 
     If `is_stationary` is true, the sensor is known to be stationary. Raises the same errors as
     `SweepStack.read`, and LidarError if the sensor or the recorded scene moves.

@@ -7,6 +7,7 @@ the number of cells.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -75,15 +76,19 @@ class _Strips:
 
     def names(self, clouds: Sequence[SurveyCloud]) -> list[str]:
         """Return the name of each strip, without parts that all strips have in common."""
+        sensors = defaultdict(set)
+        sources = defaultdict(set)
+        for file, sensor, source in self.numbers:
+            sensors[file].add(sensor)
+            sources[file].add(source)
         names = []
         for file, sensor, source in self.numbers:
-            own = [key for key in self.numbers if key[0] == file]
             parts = []
             if len(clouds) > 1:
                 parts.append(clouds[file].name.rstrip("/").rpartition("/")[2])
-            if len({other for _, other, _ in own}) > 1:
+            if len(sensors[file]) > 1:
                 parts.append(_sensor_name(clouds[file], sensor))
-            if not parts or len({other for _, _, other in own}) > 1:
+            if not parts or len(sources[file]) > 1:
                 parts.append(str(source))
             names.append(" ".join(parts))
         return names

@@ -159,7 +159,7 @@ def _world_points(recording: Recording, number: int) -> Sweep:
 def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
     """Raise LidarError if clouds state different coordinate systems or units.
 
-    Returns notes about clouds that state no coordinate system although others do.
+    Returns notes about clouds that do not specify a coordinate system although others do.
     """
     first, *others = clouds
     for other in others:
@@ -179,7 +179,7 @@ def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
     if not stated:
         return []
     return [
-        f"{cloud.name} states no coordinate system and is assumed to be in {stated[0]}"
+        f"{cloud.name} does not specify a coordinate system and is assumed to be in {stated[0]}"
         for cloud in clouds
         if cloud.system_name is None
     ]

@@ -449,9 +449,9 @@ class Reprojection:
         require_registry("Transforming a cloud to another coordinate system")
         if system is None:
             raise LidarError(
-                f"it states no coordinate system, so it cannot be transformed to EPSG:{epsg}. "
-                "Remove --epsg (epsg= in Python), or assign a system first (pdal translate IN OUT "
-                "--readers.las.override_srs=EPSG:CODE)."
+                "it does not specify a coordinate system, so it cannot be transformed to "
+                f"EPSG:{epsg}. Remove --epsg (epsg= in Python), or assign a system first "
+                "(pdal translate IN OUT --readers.las.override_srs=EPSG:CODE)."
             )
         source = system.crs
         if source is None:

@@ -49,8 +49,7 @@ class FieldOfView:
     @classmethod
     def from_sensor(cls, sensor: Sensor) -> FieldOfView:
         """Determine the field of view from the directions of the first revolution."""
-        steps = sensor.steps_of_revolution(0)
-        stop = sensor.firings(steps[-1])[1]
+        stop = sensor.firings_of_revolution(0).stop
         step = max(1, stop * sensor.channels // _FIELD_RAYS)
         firings = np.unique(np.append(np.arange(0, stop, step, dtype=np.int64), stop - 1))
         x, y, z = sensor.directions(firings).reshape(-1, 3).T

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...motion.trajectory import full_poses
+from ...motion.trajectory import mounted_poses
 from ...numerics.arrays import Floats, Indices, Integers, Ints, Ints32
-from ...numerics.vectors import matmul, matvec, rotate, rotate_into_frames
+from ...numerics.vectors import rotate, rotate_into_frames
 from ...survey.survey import ScanSpec, Survey
 from ..casting.actor_surfaces import ActorSurfaces
 from ..casting.actor_trajectories import ActorTrajectories
@@ -137,9 +137,6 @@ def _sensor_poses(survey: Survey, spec: ScanSpec, times_ns: Floats) -> tuple[Flo
 
     `times_ns` (k,) are nanoseconds since the start of the survey.
     """
-    path = survey.path
     mount = survey.mounted_sensors[spec.sensor].mount
-    since_ns = np.clip(times_ns - spec.start_ns, 0, path.duration_ns)
-    positions, rotations = full_poses(path, spec.station, since_ns)
-    lever_arms = matvec(rotations, np.array(mount.position))
-    return positions + lever_arms, matmul(rotations, mount.rotation_matrix)
+    since_ns = np.clip(times_ns - spec.start_ns, 0, survey.path.duration_ns)
+    return mounted_poses(survey.path, spec.station, mount, since_ns)

@@ -126,7 +126,7 @@ class Setup:
 
     @property
     def in_waveforms(self) -> bool:
-        """Whether the receiver finds returns in waveforms."""
+        """Whether the receiver detects returns in waveforms."""
         return self.reporting.waveform != "none"
 
     @property

@@ -40,7 +40,7 @@ class WaveformStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the sensor finds returns in waveforms."""
+        """Return whether the sensor detects returns in waveforms."""
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
