@@ -13,7 +13,7 @@ from lidarpool import LidarError, save_cloud, twin
 from lidarpool.clouds.recorded_boxes import RecordedBoxes
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.moving_objects import find_tracks
-from lidarpool.reconstruction.moving_rays import MovingRays, StationaryMasks
+from lidarpool.reconstruction.moving_rays import MovingRays, SweepMasks
 from lidarpool.reconstruction.object_clusters import find_clusters
 from lidarpool.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
 from lidarpool.reconstruction.object_tracks import ObjectTrack
@@ -157,7 +157,7 @@ def test_the_middle_of_a_long_vehicle_belongs_to_its_cluster():
 
 def test_masks_are_stored_as_bits():
     masks = {3: np.array([True, False, True]), 5: np.ones(9, bool), 8: np.zeros(0, bool)}
-    packed = StationaryMasks.from_masks(masks)
+    packed = SweepMasks.from_masks(masks)
     assert packed.bits.nbytes == 2
     for number, mask in packed.masks().items():
         np.testing.assert_array_equal(mask, masks[number])

@@ -18,13 +18,13 @@ from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
@@ -36,7 +36,7 @@ from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses
 from .recorded_sweeps import RecordedSweeps
-from .voxel_planes import VoxelPlanes
+from .voxel_planes import VoxelPlanes, cell_keys
 
 _MAP_POINTS = 40_000  # points per sweep that are added to the map
 _SWEEP_POINTS = 10_000  # points per sweep that are registered to the map
@@ -253,6 +253,23 @@ class AlignedSweep(NamedTuple):
         return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
+@dataclass(frozen=True)
+class _Cache:
+    """Results of reading the sweeps of a submap, each of which is read several times.
+
+    Attributes
+    ----------
+    compensated
+        Compensated points and the positions of their lasers, both of shape (n, 3), by sweep number
+        and part of the sweep.
+    lost
+        Lost pulses that the vehicle does not block, and the ranges at their gaps, by sweep number.
+    """
+
+    compensated: dict[tuple[int, str], tuple[Floats32, Floats32]] = field(default_factory=dict)
+    lost: dict[int, tuple[Sweep, Floats]] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class AlignedSweeps:
     """Sweeps of a recording with aligned poses. Only one sweep is read at a time."""
@@ -260,11 +277,14 @@ class AlignedSweeps:
     recorded: RecordedSweeps
     alignment: Alignment
     coverage: SensorCoverage
-    _lost: dict[int, tuple[Sweep, Floats]] | None = None
+    _cache: _Cache | None = None
 
-    def with_lost_cached(self) -> AlignedSweeps:
-        """Return a copy that keeps the lost pulses of the sweeps that are read."""
-        return replace(self, _lost={})
+    def with_cache(self) -> AlignedSweeps:
+        """Return a copy that keeps the compensated points and lost pulses of the sweeps it reads.
+
+        The points are rounded to single precision in the sensor frame, to save memory.
+        """
+        return replace(self, _cache=_Cache())
 
     @property
     def name(self) -> str:
@@ -295,7 +315,7 @@ class AlignedSweeps:
         LidarError
             If the recording cannot be read.
         """
-        return self.align(self.recorded.read(number), number)
+        return self._align_once(self.recorded.read(number), number, "returns")
 
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
         """Read a sweep, and determine which of its pulses were lost in the surroundings.
@@ -303,14 +323,20 @@ class AlignedSweeps:
         The lost pulses are represented by points one meter from their lasers. Pulses that the
         vehicle blocks did not reach the surroundings, so they are omitted.
         """
-        kept = None if self._lost is None else self._lost.get(number)
-        lost, gap_range_m = self.read_lost(number) if kept is None else kept
-        if self._lost is not None:
-            self._lost[number] = lost, gap_range_m
-        passed = ~self._are_blocked(lost)
-        aligned = self.align(lost.select(passed), number)
-        returned = self.align(self.recorded.read(number), number)
-        return returned, aligned._replace(gap_range_m=gap_range_m[passed])
+        passed, gap_range_m = self._read_passed(number)
+        aligned = self._align_once(passed, number, "lost")
+        return self.read(number), aligned._replace(gap_range_m=gap_range_m)
+
+    def _read_passed(self, number: int) -> tuple[Sweep, Floats]:
+        """Return the lost pulses that the vehicle does not block, and the ranges at their gaps."""
+        kept = None if self._cache is None else self._cache.lost.get(number)
+        if kept is None:
+            lost, gap_range_m = self.read_lost(number)
+            passed = ~self._are_blocked(lost)
+            kept = lost.select(passed), gap_range_m[passed]
+            if self._cache is not None:
+                self._cache.lost[number] = kept
+        return kept
 
     def read_lost(self, number: int) -> tuple[Sweep, Floats]:
         """Determine the lost pulses of a sweep and the ranges at their gaps, as `lost_pulses` does.
@@ -352,7 +378,23 @@ class AlignedSweeps:
 
     def align(self, sweep: Sweep, number: int) -> AlignedSweep:
         """Transform the points of a sweep to world coordinates."""
-        points, origins = self.alignment.compensate(sweep, number)
+        return self._place(sweep, number, *self.alignment.compensate(sweep, number))
+
+    def _align_once(
+        self, sweep: Sweep, number: int, part: Literal["returns", "lost"]
+    ) -> AlignedSweep:
+        """Align a part of a sweep, and keep its compensated points if there is a cache."""
+        if self._cache is None:
+            return self.align(sweep, number)
+        kept = self._cache.compensated.get((number, part))
+        if kept is None:
+            points, origins = self.alignment.compensate(sweep, number)
+            kept = points.astype(np.float32), origins.astype(np.float32)
+            self._cache.compensated[number, part] = kept
+        return self._place(sweep, number, *(array.astype(np.float64) for array in kept))
+
+    def _place(self, sweep: Sweep, number: int, points: Floats, origins: Floats) -> AlignedSweep:
+        """Transform compensated points and the positions of their lasers to world coordinates."""
         pose = self.alignment.poses[number]
         return AlignedSweep(
             points=points,
@@ -485,10 +527,8 @@ def _filled_voxels(
         parts.append(transform_points(points[near], alignment.poses[number]))
     # A level floor on a voxel boundary fills two layers of voxels, but only one layer of a shifted
     # grid.
-    cells = np.concatenate(parts) / voxel_m
-    return sum(
-        len(np.unique(np.floor(cells + shift).astype(np.int64), axis=0)) for shift in _SHIFTS
-    )
+    placed = np.concatenate(parts)
+    return sum(len(np.unique(cell_keys(placed + shift * voxel_m, voxel_m))) for shift in _SHIFTS)
 
 
 def _fastest_window(poses: RecordedPoses) -> slice:

@@ -50,7 +50,7 @@ from .isolated_returns import IsolatedRanges
 from .labels import split_by_object
 from .lost_pulses import SensorCoverage
 from .moving_objects import LabeledTracks
-from .moving_rays import MovingRays, StationaryMasks
+from .moving_rays import MovingRays, SweepMasks
 from .odometry import RecordedPoses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
@@ -58,7 +58,7 @@ from .recorded_actors import RecordedActor, actors_of
 from .recorded_sensor import FittedSensor, SweepTiming, fit_sensor
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, Response, fit_response
-from .submap_objects import MovingObjects, ObjectMap
+from .submap_objects import MovingObjects, ObjectMap, ObjectTask
 from .submap_tasks import (
     BuildTask,
     MotionTask,
@@ -84,7 +84,7 @@ _COMPARED_SWEEPS = 12  # held-out sweeps that are compared
 _RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
 _POSES = TwinStep("poses", (RecordedPoses, VehicleReturns, IsolatedRanges))
 _ALIGN = TwinStep("align", (AlignedSubmap,))
-_MOTION = TwinStep("motion", (StationaryMasks, StationaryMasks, MovingRays, MovingRays))
+_MOTION = TwinStep("motion", (SweepMasks, SweepMasks, SweepMasks, MovingRays, MovingRays))
 _BUILD = TwinStep(
     "build",
     (
@@ -355,18 +355,18 @@ class _Building:
         tasks = [replace(motion, submap=one) for one in submaps]
         parts = [
             (of_all, of_mapped)
-            for _, _, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks)
+            for *_, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks)
         ]
         of_all, of_mapped = (MovingRays.concatenate(part) for part in zip(*parts, strict=True))
+        del parts  # to save memory
         sweep_s = task.alignment.sweep_s
         size = self.voxel_m, self.recorded.gap_rad
-        return MovingObjects(
-            ObjectMap.from_rays(of_all, None if used is None else used.all, sweep_s, *size),
-            ObjectMap.from_rays(
-                of_mapped, None if used is None else used.in_mapped, 2 * sweep_s, *size
-            ),
-            None if labels is None else labels.all,
-        )
+        object_tasks = [
+            ObjectTask(of_all, None if used is None else used.all, sweep_s, *size),
+            ObjectTask(of_mapped, None if used is None else used.in_mapped, 2 * sweep_s, *size),
+        ]
+        in_all, in_mapped = run(ObjectMap.from_task, object_tasks)
+        return MovingObjects(in_all, in_mapped, None if labels is None else labels.all)
 
     def _build_submaps(
         self,
@@ -387,7 +387,7 @@ class _Building:
         return _Built(parts, submaps)
 
     def _load_observations(self, index: int) -> Observations:
-        observations: Observations = self.steps.load(_BUILD, index)[1]
+        observations: Observations = self.steps.load_record(_BUILD, index, 1)
         return observations
 
     def _assemble(
@@ -672,9 +672,9 @@ class _BuildTasks(Sequence[BuildTask]):
         submap = self.submaps[index]
         objects = None
         if self.moving is not None:
-            masks, mapped, _, _ = self.steps.load(_MOTION, index)
+            masks = (self.steps.load_record(_MOTION, index, number) for number in range(3))
             times_s = self.task.alignment.times_s[submap.numbers]
-            objects = self.moving.between(float(times_s[0]), float(times_s[-1]), masks, mapped)
+            objects = self.moving.between(float(times_s[0]), float(times_s[-1]), *masks)
         return replace(self.task, submap=submap, objects=objects)
 
 

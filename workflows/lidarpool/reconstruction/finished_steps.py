@@ -11,7 +11,7 @@ import pickle
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -137,12 +137,17 @@ class FinishedSteps:
         LidarError
             If the results are damaged or missing.
         """
+        return tuple(self._load_records(step, index, range(len(step.kinds))))
+
+    def load_record(self, step: TwinStep, index: int, number: int) -> Any:
+        """Load one of the records that a step has computed for an item, as `load` does."""
+        return self._load_records(step, index, [number])[0]
+
+    def _load_records(self, step: TwinStep, index: int, numbers: Iterable[int]) -> list[Any]:
         file = self._file(step, index)
         try:
             with file.open("rb") as opened, np.load(opened) as arrays:
-                return tuple(
-                    _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
-                )
+                return [_record(step.kinds[number], f"{number}.", arrays) for number in numbers]
         except _DAMAGED as error:
             raise LidarError(
                 f"The step file {file} is missing or damaged. Delete it, and continue with "

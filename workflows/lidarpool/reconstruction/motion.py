@@ -105,8 +105,16 @@ class MotionStep(NamedTuple):
         Each group has shape (n, 3), and its points were fired at the given fractions of the step,
         of shape (n,).
         """
-        from scipy.spatial.transform import Rotation
-
-        rotations = Rotation.from_rotvec(shares[:, None] * self.rotation)
         moved = shares[:, None] * self.translation
-        return [rotations.apply(points) + moved for points in groups]
+        turn_rad = float(np.linalg.norm(self.rotation))
+        if not turn_rad:
+            return [points + moved for points in groups]
+        # Rodrigues' formula for the rotation of points about a common axis
+        x, y, z = self.rotation / turn_rad
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        sine = np.sin(turn_rad * shares)[:, None]
+        versine = 2 * np.square(np.sin(turn_rad / 2 * shares))[:, None]
+        return [
+            points + moved + sine * (points @ cross.T) + versine * (points @ (cross @ cross).T)
+            for points in groups
+        ]

@@ -25,6 +25,7 @@ _MAX_RAYS = 3000  # maximum number of rays per object and sweep
 _SWEEP_S = 0.1  # typical duration of a sweep, in which a labeled object moves
 _LASER_M = 1.0  # maximum distance of a laser from the mean position of all lasers
 _MIN_DISTANCE = 1.5  # Boxes that are closer, in multiples of their radius, surround the sensor.
+_TURN = 2 * np.pi
 _BEHIND_M = 0.1  # A ray that ends this close to the front of a box belongs to it.
 
 
@@ -88,24 +89,24 @@ class MovingRays(NamedTuple):
         return {number: slice(start, stop) for number, start, stop in bounds}
 
 
-class StationaryMasks(NamedTuple):
-    """Masks of the stationary points of k sweeps, with one bit per point."""
+class SweepMasks(NamedTuple):
+    """Masks of the points of k sweeps, with one bit per point."""
 
     numbers: Ints  # (k,), sweep numbers
     counts: Ints  # (k,), points in each sweep
     bits: Bytes  # packed masks, one after the other
 
     @classmethod
-    def from_masks(cls, masks: Mapping[int, Bools]) -> StationaryMasks:
+    def from_masks(cls, masks: Mapping[int, Bools]) -> SweepMasks:
         """Pack the masks, which are keyed by sweep number."""
         counts = np.array([len(mask) for mask in masks.values()], np.int64)
-        bits = np.packbits(np.concatenate([*masks.values()]))
+        bits = np.packbits(np.concatenate([np.empty(0, bool), *masks.values()]))
         return cls(np.array([*masks], np.int64), counts, bits)
 
     def masks(self) -> dict[int, Bools]:
         """Return the masks, keyed by sweep number."""
         joined = np.unpackbits(self.bits, count=int(self.counts.sum())).astype(bool)
-        parts = np.split(joined, np.cumsum(self.counts)[:-1])
+        parts = np.split(joined, np.cumsum(self.counts))[:-1]
         return dict(zip(self.numbers.tolist(), parts, strict=True))
 
 
@@ -133,6 +134,20 @@ class TimedPulses(NamedTuple):
         return np.concatenate([self.returns.world, self.lost.world])
 
 
+def return_times_s(sweeps: AlignedSweeps, number: int) -> Floats:
+    """Return the firing times of the returns of a sweep in seconds.
+
+    The times are on the clock of the timestamps. If they are unknown, they are the timestamp of the
+    sweep.
+    """
+    alignment = sweeps.alignment
+    sweep = sweeps.recorded.read(number)
+    times_s = alignment.motion.times_s(sweep, alignment.sweep_s)
+    for name in ("time_s", "fired_s"):  # of motion-compensated points
+        times_s = sweep.columns.get(name) if times_s is None else times_s
+    return float(alignment.times_s[number]) + (np.zeros(len(sweep)) if times_s is None else times_s)
+
+
 def pulse_times_s(
     sweeps: AlignedSweeps, number: int, returns: AlignedSweep, lost: AlignedSweep
 ) -> Floats:
@@ -141,22 +156,17 @@ def pulse_times_s(
     The times are on the clock of the timestamps. A lost pulse has the time of the return with the
     closest azimuth.
     """
-    alignment = sweeps.alignment
-    stamp_s = float(alignment.times_s[number])
-    sweep = sweeps.recorded.read(number)
-    times_s = alignment.motion.times_s(sweep, alignment.sweep_s)
-    for name in ("time_s", "fired_s"):  # of motion-compensated points
-        times_s = sweep.columns.get(name) if times_s is None else times_s
-    if times_s is None or not len(sweep):
-        return np.full(len(returns.world) + len(lost.world), stamp_s)
-    rotation = alignment.poses[number][:3, :3]
+    times_s = return_times_s(sweeps, number)
+    if not len(times_s):
+        return np.full(len(lost.world), float(sweeps.alignment.times_s[number]))
+    rotation = sweeps.alignment.poses[number][:3, :3]
     azimuths = []
     for part in (returns, lost):
         directions = (part.world - part.origins) @ rotation
         azimuths.append(np.arctan2(directions[:, 1], directions[:, 0]))
     order = np.argsort(azimuths[0])
     nearest = np.searchsorted(azimuths[0][order], azimuths[1]).clip(max=len(order) - 1)
-    return np.asarray(stamp_s + np.append(times_s, times_s[order[nearest]]))
+    return np.append(times_s, times_s[order[nearest]])
 
 
 def collect_moving_rays(
@@ -245,9 +255,10 @@ def _rays_near(
     directions = vectors / np.maximum(range_m, 1e-9)[:, None]
     range_m[len(cluster) :] = np.inf
     in_cluster = np.append(cluster >= 0, np.zeros(len(ends) - len(cluster), bool))
+    sorted_rays = _SortedRays.from_rays(origins, directions)
     for box in boxes:
         low, high = box.low - _MARGIN_M, box.high + _MARGIN_M
-        rows = _rows_toward(low, high, origins, directions)
+        rows = sorted_rays.rows_toward(low, high)
         enter_m, leave_m = box_distances(low, high, origins[rows], directions[rows])
         rows = rows[(leave_m >= np.maximum(enter_m, 0)) & (range_m[rows] > enter_m - _BEHIND_M)]
         if len(rows) > _MAX_RAYS:
@@ -258,15 +269,42 @@ def _rays_near(
     return chosen
 
 
-def _rows_toward(low: Floats, high: Floats, origins: Floats, directions: Floats) -> Ints:
-    """Return the rays that may pass through a box, whose corners are given."""
-    toward = (low + high) / 2 - origins.mean(axis=0)
-    distance_m = float(np.linalg.norm(toward))
-    radius_m = float(np.linalg.norm(high - low)) / 2 + _LASER_M
-    if distance_m < _MIN_DISTANCE * radius_m:
-        return np.arange(len(origins))
-    cosine = np.sqrt(1 - (radius_m / distance_m) ** 2)
-    return np.flatnonzero(directions @ (toward / distance_m) > cosine)
+class _SortedRays(NamedTuple):
+    """Rays of a sweep, sorted by azimuth."""
+
+    center: Floats  # (3,), mean position of the lasers, meters
+    order: Ints  # (n,), original indices of the rays
+    azimuth: Floats  # (n,), radians, ascending
+    directions: Floats  # (n, 3)
+
+    @classmethod
+    def from_rays(cls, origins: Floats, directions: Floats) -> _SortedRays:
+        """Sort rays by azimuth."""
+        azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+        order = np.argsort(azimuth)
+        return cls(origins.mean(axis=0), order, azimuth[order], directions[order])
+
+    def rows_toward(self, low: Floats, high: Floats) -> Ints:
+        """Return the original indices of the rays that may pass through a box, in ascending order.
+
+        The box is given by two corners.
+        """
+        toward = (low + high) / 2 - self.center
+        distance_m = float(np.linalg.norm(toward))
+        level_m = float(np.hypot(toward[0], toward[1]))
+        radius_m = float(np.linalg.norm(high - low)) / 2 + _LASER_M
+        if level_m < _MIN_DISTANCE * radius_m:
+            return np.arange(len(self.order))
+        middle = float(np.arctan2(toward[1], toward[0]))
+        half = float(np.arcsin(radius_m / level_m))
+        cosine = np.sqrt(1 - (radius_m / distance_m) ** 2)
+        found = []
+        for turn in (-_TURN, 0, _TURN):  # The sector of the box may extend beyond -pi or pi.
+            bounds = middle - half + turn, middle + half + turn
+            sector = slice(*np.searchsorted(self.azimuth, bounds))
+            near = self.directions[sector] @ (toward / distance_m) > cosine
+            found.append(self.order[sector][near])
+        return np.sort(np.concatenate(found))
 
 
 def box_distances(

@@ -9,12 +9,14 @@ fractions, so that a ray passes through all surfels of a layer as often as in th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.numerics.arrays import Bools, Bytes, Floats, Floats32, Ints, Ints32
+
+from .porosity_loops import RaySums, add_rays
 
 _PRIOR_RAYS = 2.2  # weight of the prior, in rays
 _PRIOR_GAPS = 0.2  # rays of the prior that pass through, without observations nearby
@@ -59,48 +61,6 @@ class Crossings(NamedTuple):
             self.range_m,
         )
 
-    def first_ends(self, dark: Bools, on_surfel_m: float) -> _RayCounts:
-        """Count the rays, assuming that each ends on the first surfel close to its return."""
-        near = self._near(dark, on_surfel_m)
-        first = np.zeros(near.shape)
-        rows = np.flatnonzero(near.any(axis=1))
-        first[rows, near[rows].argmax(axis=1)] = 1
-        return self._count(first, len(dark), on_surfel_m)
-
-    def expected_ends(self, gap_fraction: Floats, dark: Bools, on_surfel_m: float) -> _RayCounts:
-        """Count the rays, given the gap fractions of the m surfels."""
-        gaps = np.where(self.present, gap_fraction[self.surfel], 1.0)
-        reaching = np.cumprod(gaps, axis=1)
-        reaching = np.column_stack([np.ones(len(gaps)), reaching[:, :-1]])
-        ending = np.where(self._near(dark, on_surfel_m), reaching * (1 - gaps), 0)
-        ending /= np.maximum(ending.sum(axis=1, keepdims=True), 1e-300)
-        return self._count(ending, len(dark), on_surfel_m)
-
-    def _near(self, dark: Bools, on_surfel_m: float) -> Bools:
-        near = np.abs(self.range_m[:, None] - self.distance_m) < on_surfel_m
-        return np.asarray(near & self.present & ~dark[self.surfel])
-
-    def _count(self, ending: Floats, count: int, on_surfel_m: float) -> _RayCounts:
-        """Add up the probabilities (n, k) that rays end on their surfels, for `count` surfels."""
-        beyond_m = np.where(self.present, self.range_m[:, None] - self.distance_m, 0)
-        ends = ending.any(axis=1, keepdims=True)
-        later = 1 - np.cumsum(ending, axis=1)  # probability that the ray ends on a later surfel
-        passing = np.where(ends, later, beyond_m > on_surfel_m)
-        present = self.present
-        surfel = self.surfel[present]
-        offset_m = beyond_m[present]
-        return _RayCounts(
-            *(
-                np.asarray(np.bincount(surfel, weights, count), np.float64)
-                for weights in (
-                    ending[present],
-                    np.maximum(passing[present], 0),
-                    ending[present] * offset_m,
-                    ending[present] * np.square(offset_m),
-                )
-            )
-        )
-
 
 class Porosity(NamedTuple):
     """Gaps of m surfels, and depths of their returns."""
@@ -134,12 +94,10 @@ class Porosity(NamedTuple):
 
         neighbors = cKDTree(centers).query(centers, min(_NEIGHBORS, len(centers)))[1]
         neighbors = neighbors.reshape(len(centers), -1)
-        counts = _RayCounts.sum(one.first_ends(dark, on_surfel_m) for one in sweeps)
+        counts = _RayCounts.from_crossings(sweeps, np.empty(0), dark, on_surfel_m)
         for _ in range(_ROUNDS):
             gap_fraction = counts.gap_fraction(neighbors)
-            counts = _RayCounts.sum(
-                one.expected_ends(gap_fraction, dark, on_surfel_m) for one in sweeps
-            )
+            counts = _RayCounts.from_crossings(sweeps, gap_fraction, dark, on_surfel_m)
         gap_fraction = np.where(dark, 0, counts.gap_fraction(neighbors))
         gap_fraction = dithered(gap_fraction, _GAP_STEP).clip(max=_MAX_GAP_FRACTION)
         porous = gap_fraction > 0
@@ -166,21 +124,21 @@ class Porosity(NamedTuple):
         return np.asarray((cumulative >= cumulative[:, -1:] / 2).argmax(axis=1))
 
 
-class _RayCounts(NamedTuple):
-    """Rays that end on each of m surfels or pass through it, and their offsets."""
-
-    ending: Floats  # (m,)
-    passing: Floats  # (m,)
-    sum_m: Floats  # (m,), sum of the recorded minus the simulated ranges of the ending rays
-    sum_m2: Floats  # (m,), sum of their squares
+class _RayCounts(RaySums):
+    """Rays that end on each of m surfels or pass through it."""
 
     @classmethod
-    def sum(cls, parts: Iterable[_RayCounts]) -> _RayCounts:
-        """Add the counts of several sweeps."""
-        total = next(iterator := iter(parts))
-        for part in iterator:
-            total = cls(*(a + b for a, b in zip(total, part, strict=True)))
-        return total
+    def from_crossings(
+        cls, sweeps: Sequence[Crossings], gap_fraction: Floats, dark: Bools, on_surfel_m: float
+    ) -> _RayCounts:
+        """Count the rays of several sweeps, given the gap fractions of the surfels.
+
+        If `gap_fraction` is empty, each ray ends on the first surfel that is close to its return.
+        """
+        counts = cls(*np.zeros((4, len(dark))))
+        for one in sweeps:
+            add_rays(one, gap_fraction, dark, on_surfel_m, RaySums(*counts))
+        return counts
 
     def gap_fraction(self, neighbors: Ints) -> Floats:
         """Return the share of the rays that pass through each surfel.
@@ -198,8 +156,8 @@ class _RayCounts(NamedTuple):
 
         The result has shape (m,). Surfels with few rays have about the mean of the chosen surfels.
         """
-        offset_m = self.sum_m / np.maximum(self.ending, 1e-9)
-        total_m2 = np.maximum(self.sum_m2 - self.ending * offset_m**2, 0)
+        offset_m = self.offset_m / np.maximum(self.ending, 1e-9)
+        total_m2 = np.maximum(self.squared_m2 - self.ending * offset_m**2, 0)
         degrees = np.maximum(self.ending - 1, 0)
         typical_m2 = total_m2[chosen].sum() / max(float(degrees[chosen].sum()), 1.0)
         variance_m2 = total_m2 + _PRIOR_SPREAD_RAYS * typical_m2

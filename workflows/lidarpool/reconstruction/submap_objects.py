@@ -13,12 +13,22 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 from .alignment import AlignedSweeps
 from .held_out import HeldOutPulses, HeldOutRays
 from .moving_objects import find_tracks
-from .moving_rays import MovingRays, StationaryMasks, pulse_times_s
+from .moving_rays import MovingRays, SweepMasks, pulse_times_s, return_times_s
 from .object_surfels import ObjectHits, RecordedObject, cast_to_objects, reconstruct_objects
 from .object_tracks import ObjectTrack, in_any_box
 from .reflectances import Reflectances, Response
 
 _STEP_S = 0.1  # step of the times at which objects are sought near a submap
+
+
+class ObjectTask(NamedTuple):
+    """Task of finding and reconstructing the moving objects according to some sweeps."""
+
+    rays: MovingRays  # rays of the sweeps near moving objects
+    labeled: Sequence[ObjectTrack] | None  # labeled boxes, or None to find the objects
+    sweep_s: float  # typical time between the sweeps, seconds
+    voxel_m: float  # edge length of the voxels of the scene, meters
+    gap_rad: float  # angle between the rays of neighboring rings, radians
 
 
 class ObjectMap(NamedTuple):
@@ -28,33 +38,12 @@ class ObjectMap(NamedTuple):
     objects: Sequence[RecordedObject]
 
     @classmethod
-    def from_rays(
-        cls,
-        rays: MovingRays,
-        labeled: Sequence[ObjectTrack] | None,
-        sweep_s: float,
-        voxel_m: float,
-        gap_rad: float,
-    ) -> ObjectMap:
-        """Find and reconstruct the moving objects.
-
-        Parameters
-        ----------
-        rays
-            Rays of the sweeps near moving objects.
-        labeled
-            Labeled boxes of moving objects, or None to find the objects.
-        sweep_s
-            Typical time between the sweeps in seconds.
-        voxel_m
-            Edge length of the voxels of the scene in meters.
-        gap_rad
-            Angle between the rays of neighboring rings in radians.
-        """
-        tracks = find_tracks(rays, labeled, sweep_s)
-        objects = reconstruct_objects(tracks, rays, voxel_m, gap_rad)
+    def from_task(cls, task: ObjectTask) -> ObjectMap:
+        """Find and reconstruct the moving objects."""
+        tracks = find_tracks(task.rays, task.labeled, task.sweep_s)
+        objects = reconstruct_objects(tracks, task.rays, task.voxel_m, task.gap_rad)
         # Points of objects that were found but have too few points remain as they are classified.
-        return cls([one.track for one in objects] if labeled is None else tracks, objects)
+        return cls([one.track for one in objects] if task.labeled is None else tracks, objects)
 
     def between(self, times_s: Floats) -> ObjectMap:
         """Select what is present at one of the times at least."""
@@ -77,16 +66,28 @@ class MovingObjects(NamedTuple):
     labeled: Sequence[ObjectTrack] | None  # boxes from labels, None without labels
 
     def between(
-        self, first_s: float, last_s: float, masks: StationaryMasks, mapped: StationaryMasks
+        self,
+        first_s: float,
+        last_s: float,
+        air: SweepMasks,
+        stationary: SweepMasks,
+        stationary_in_mapped: SweepMasks,
     ) -> SubmapObjects:
         """Return the objects that are present between two times.
 
-        `masks` and `mapped` are the stationary points of a submap.
+        The masks are those of a submap.
         """
         times_s = np.linspace(first_s, last_s, 2 + int((last_s - first_s) / _STEP_S))
         of_all = self.of_all.between(times_s)
         boxes = of_all.tracks if self.labeled is None else present(self.labeled, times_s)
-        return SubmapObjects(masks, mapped, of_all.tracks, boxes, self.of_mapped.between(times_s))
+        return SubmapObjects(
+            air,
+            stationary,
+            stationary_in_mapped,
+            of_all.tracks,
+            boxes,
+            self.of_mapped.between(times_s),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,8 @@ class SubmapObjects:
 
     Attributes
     ----------
+    air
+        Returns from the air. The other masks refer to the remaining points.
     masks, masks_of_mapped
         Points that are stationary according to the free space, in all sweeps and in the sweeps that
         form the map.
@@ -106,8 +109,9 @@ class SubmapObjects:
         Objects according to the sweeps that form the map.
     """
 
-    masks: StationaryMasks
-    masks_of_mapped: StationaryMasks
+    air: SweepMasks
+    masks: SweepMasks
+    masks_of_mapped: SweepMasks
     tracks: Sequence[ObjectTrack]
     boxes: Sequence[ObjectTrack]
     of_mapped: ObjectMap
@@ -198,7 +202,6 @@ def _without_objects(
     """Remove the points in the boxes of moving objects from masks of stationary points."""
     found = {}
     for number, mask in masks.items():
-        sweep = sweeps.read(number)
-        times_s = pulse_times_s(sweeps, number, sweep, sweep)[: len(mask)]
-        found[number] = mask & ~in_any_box(tracks, sweep.world, times_s)
+        times_s = return_times_s(sweeps, number)
+        found[number] = mask & ~in_any_box(tracks, sweeps.read(number).world, times_s)
     return found

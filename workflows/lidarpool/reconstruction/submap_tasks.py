@@ -19,7 +19,7 @@ from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage
 from .moving_objects import LabeledTracks
-from .moving_rays import MovingRays, StationaryMasks, collect_moving_rays
+from .moving_rays import MovingRays, SweepMasks, collect_moving_rays
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps
@@ -84,11 +84,14 @@ class BuildTask(SubmapTask):
         recorded = self.recorded.with_cached(self.submap.numbers.tolist())
         return AlignedSweeps(recorded, self.alignment, self.coverage)
 
-    def read_without_air(self) -> tuple[AlignedSweeps, dict[int, Bools]]:
+    def read_without_air(self) -> tuple[AlignedSweeps, Mapping[int, Bools]]:
         """Read the sweeps without the returns from the air, and return the masks of these."""
         sweeps = self.read()
-        air = find_air_returns(sweeps, self.submap.numbers.tolist())
-        return replace(sweeps, recorded=sweeps.recorded.without_air(air)), air
+        if self.objects is not None:
+            air = self.objects.air.masks()
+        else:
+            air = find_air_returns(sweeps, self.submap.numbers.tolist())
+        return replace(sweeps, recorded=sweeps.recorded.without_air(air)).with_cache(), air
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,13 +183,14 @@ def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
 
 def find_moving_rays(
     task: MotionTask,
-) -> tuple[StationaryMasks, StationaryMasks, MovingRays, MovingRays]:
+) -> tuple[SweepMasks, SweepMasks, SweepMasks, MovingRays, MovingRays]:
     """Find the points on moving objects in a submap, and collect the rays near these objects.
 
-    Returns the masks of the stationary points of all sweeps, and those that follow from the sweeps
-    that form the map alone. The rays are those of the submap's own sweeps, in the same order.
+    Returns the masks of the returns from the air, of the stationary points of all sweeps, and of
+    those that follow from the sweeps that form the map alone. The rays are those of the submap's
+    own sweeps, in the same order.
     """
-    sweeps, _ = task.read_without_air()
+    sweeps, air = task.read_without_air()
     numbers = task.submap.numbers
     own = task.submap.own_numbers
     labels = task.labels or LabeledTracks((), ())
@@ -197,10 +201,10 @@ def find_moving_rays(
         (np.intersect1d(numbers, task.mapped), labels.in_mapped),
     ):
         stationary = find_stationary_points(sweeps, chosen.tolist())
-        masks.append(StationaryMasks.from_masks(stationary))
+        masks.append(SweepMasks.from_masks(stationary))
         collected = np.intersect1d(chosen, own).tolist()
         rays.append(collect_moving_rays(sweeps, stationary, collected, labeled))
-    return masks[0], masks[1], rays[0], rays[1]
+    return SweepMasks.from_masks(air), masks[0], masks[1], rays[0], rays[1]
 
 
 def build_submap(task: BuildTask) -> BuiltSubmap:

@@ -35,6 +35,7 @@ from .alignment import AlignedSweep, AlignedSweeps
 from .outlines import Extents, crossed_cells
 from .porosity import Crossings, Porosity
 from .surfels import Surfels
+from .voxel_planes import cell_keys
 
 _ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
 _MAX_SHIFT_M = 0.3  # Rays with a larger range difference do not move a surfel.
@@ -42,8 +43,6 @@ _SHIFT_PRIOR = 1.0  # weight of the current position of a surfel, in rays
 _VOTING_SWEEPS = 40  # maximum number of evenly spaced sweeps per submap that vote
 _ON_SURFEL_M = 0.06  # maximum distance between a point on a surfel and its plane
 _VIEW_CELL_M = 0.5  # edge length of the cells in which ranges of points are compared
-_CELL_BITS = 21  # bits per cell coordinate, which repeats after one million meters
-_CELL_MASK = (1 << _CELL_BITS) - 1
 _MAX_VIEW_FACTOR = 1.5  # Points are omitted beyond this multiple of the shortest range in a cell.
 _ON_RAY_M = 0.15  # maximum range difference of a ray that ends on a surfel
 # Votes of a ray that ends on a surfel. A surfel remains if at least a fifth of its rays end on it,
@@ -170,9 +169,19 @@ class SurfaceMap:
         distance_m = crossings.distance_m[rows, layer[rows]].astype(np.float64)
         return self._hits(sweep, rows, surfel, distance_m)
 
-    def crossings(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Crossings:
-        """Return the surfels that the rays of a sweep cross, or only those `chosen` marks."""
-        rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
+    def crossings(self, sweep: AlignedSweep) -> Crossings:
+        """Return the surfels that the rays of a sweep cross."""
+        return self._crossings(sweep, np.arange(len(sweep.world)), is_whole=True)
+
+    def crossings_to_returns(self, sweep: AlignedSweep, chosen: Bools) -> Crossings:
+        """Return the surfels that the rays `chosen` cross up to their returns.
+
+        Surfels farther behind a return than the range tolerance may be missing.
+        """
+        return self._crossings(sweep, np.flatnonzero(chosen), is_whole=False)
+
+    def _crossings(self, sweep: AlignedSweep, rows: Ints, *, is_whole: bool) -> Crossings:
+        """Return the surfels that some rays cross, or only those up to their returns."""
         origins = sweep.origins[rows]
         directions = sweep.world[rows] - origins
         range_m = np.linalg.norm(directions, axis=1)
@@ -180,6 +189,7 @@ class SurfaceMap:
         surfel = np.full((len(rows), _MAX_CROSSINGS), -1, np.int32)
         distance_m = np.full(surfel.shape, np.inf, np.float32)
         cell = np.zeros(surfel.shape, np.uint8)
+        stop_m = np.full(len(rows), np.inf) if is_whole else range_m + _ON_RAY_M
         active = np.arange(len(rows))
         start_m = np.zeros(len(rows))
         for layer in range(_MAX_CROSSINGS):
@@ -193,6 +203,8 @@ class SurfaceMap:
             points = origins[active] + start_m[:, None] * directions[active]
             cell[active, layer] = crossed_cells(self.surfels, surfel[active, layer], points)
             start_m += _BEHIND_M
+            reached = start_m < stop_m[active]
+            active, start_m = active[reached], start_m[reached]
         return Crossings(surfel, distance_m, cell, range_m)
 
     def _hits(
@@ -219,7 +231,7 @@ class SurfaceMap:
         lost_crossings = []
         for number in _evenly_chosen(stationary, _POROSITY_SWEEPS):
             sweep, lost = sweeps.read_with_lost(number)
-            crossings.append(self.crossings(sweep, stationary[number]))
+            crossings.append(self.crossings_to_returns(sweep, stationary[number]))
             lost_crossings.append(self.crossings(lost).as_lost())
         dark = self.surfels.dark
         extents = Extents.from_crossings([*crossings, *lost_crossings], dark, _ON_RAY_M)
@@ -300,7 +312,6 @@ def build_surface_map(
     LidarError
         If there are too few stationary points.
     """
-    sweeps = sweeps.with_lost_cached()
     points, outward, labels = _stationary_points(sweeps, stationary)
     if not len(points):
         raise LidarError(
@@ -387,9 +398,8 @@ def _stationary_points(
     for number, mask in stationary.items():
         sweep = sweeps.read(number)
         rows = np.flatnonzero(mask)
-        limit_m = (
-            _MAX_VIEW_FACTOR * closest_m[np.searchsorted(cells, _view_cells(sweep.world[rows]))]
-        )
+        occupied = cell_keys(sweep.world[rows], _VIEW_CELL_M)
+        limit_m = _MAX_VIEW_FACTOR * closest_m[np.searchsorted(cells, occupied)]
         kept = rows[sweep.range_m[rows] <= limit_m]
         positions.append(sweep.world[kept])
         outward.append((sweep.origins[kept] - sweep.world[kept]).astype(np.float32))
@@ -418,7 +428,8 @@ def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> t
     shortest_m = []
     for number, mask in stationary.items():
         sweep = sweeps.read(number)
-        found, closest_m = _shortest(_view_cells(sweep.world[mask]), sweep.range_m[mask])
+        occupied = cell_keys(sweep.world[mask], _VIEW_CELL_M)
+        found, closest_m = _shortest(occupied, sweep.range_m[mask])
         cells.append(found)
         shortest_m.append(closest_m)
     return _shortest(np.concatenate(cells), np.concatenate(shortest_m))
@@ -426,11 +437,7 @@ def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> t
 
 def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
     """Return the distinct cells in ascending order, and the shortest range in each of them."""
-    order = np.lexsort((range_m, cells))
-    found, firsts = np.unique(cells[order], return_index=True)
-    return found, range_m[order][firsts]
-
-
-def _view_cells(points: Floats) -> Ints:
-    cells = np.floor(points / _VIEW_CELL_M).astype(np.int64) & _CELL_MASK
-    return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])
+    found, inverse = np.unique(cells, return_inverse=True)
+    shortest_m = np.full(len(found), np.inf)
+    np.minimum.at(shortest_m, inverse, range_m)
+    return found, shortest_m

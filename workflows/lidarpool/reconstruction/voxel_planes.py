@@ -14,7 +14,18 @@ from ..scenario.point_scene import PointVoxels
 
 _NEIGHBORS = 12
 _MAX_FLAT = 0.1  # maximum variance along the normal relative to the smaller variance in the plane
+_CELL_BITS = 21  # bits per cell coordinate
+_CELL_MASK = (1 << _CELL_BITS) - 1
 _MIN_WIDTH = 0.05  # minimum ratio of the variances within a plane, below which it is a line
+
+
+def cell_keys(points: Floats, cell_m: float) -> Ints:
+    """Return an integer for each point that is the same for points in the same cubic cell.
+
+    The points have shape (n, 3), in meters. The keys repeat after 2 million cells.
+    """
+    cells = np.floor(points / cell_m).astype(np.int64) & _CELL_MASK
+    return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])
 
 
 @dataclass(frozen=True, eq=False)
