@@ -147,12 +147,29 @@ def test_the_middle_of_a_long_vehicle_belongs_to_its_cluster():
     bus = np.column_stack([along.ravel(), np.full(along.size, 4.0), height.ravel()])
     moved = (bus[:, 0] < 1) | (bus[:, 0] > 5)
     other = bus + np.array([0, 3, 0])
-    cluster = find_clusters(
-        np.concatenate([bus, other]), np.append(moved, np.zeros(len(bus), bool))
-    )
+    points = np.concatenate([bus, other, level_ground()])
+    cluster = find_clusters(points, np.append(moved, np.zeros(len(points) - len(bus), bool)))
     above = bus[:, 2] > 0.65  # the lowest points may be on the ground
     assert set(cluster[: len(bus)][above].tolist()) == {0}
     assert set(cluster[len(bus) :].tolist()) == {-1}
+
+
+def test_ground_that_seems_to_move_does_not_belong_to_a_cluster():
+    along, height = np.meshgrid(np.arange(0, 4, 0.1), np.arange(0.05, 1.5, 0.05))
+    car = np.column_stack([along.ravel(), np.full(along.size, 4.0), height.ravel()])
+    ground = level_ground()
+    moved = (ground[:, 0] < 6) & (np.random.default_rng(1).random(len(ground)) < 0.5)
+    cluster = find_clusters(
+        np.concatenate([car, ground]), np.concatenate([np.ones(len(car), bool), moved])
+    )
+    assert set(cluster[: len(car)][car[:, 2] > 0.3].tolist()) == {0}
+    assert set(cluster[len(car) :].tolist()) == {-1}
+
+
+def level_ground():
+    """Return points on level ground at z = 0."""
+    x, y = np.meshgrid(np.arange(-2, 12, 0.2), np.arange(0, 10, 0.2))
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
 def test_masks_are_stored_as_bits():

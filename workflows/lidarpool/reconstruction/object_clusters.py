@@ -22,6 +22,8 @@ _CONNECTED_M = 4.0  # maximum distance of these cells from the points that moved
 _HEIGHT_M = 2.0  # maximum height of these cells above the points that moved
 _BOTTOM_M = 0.1  # Points closer to the lowest point that moved may be on the ground.
 _MIN_MOVED = 0.15  # minimum share of points that moved among connected points
+_GROUND_CELL_M = 1.0  # edge length of the cells in which the lowest points are sought
+_GROUND_M = 0.25  # maximum height of points on the ground above the lowest points
 _MIN_POINTS = 5
 _MAX_SIZE_M = 20.0  # Larger clusters are not single objects.
 _MAX_MISSING = 5.5  # maximum time between two observations, in sweeps
@@ -86,6 +88,7 @@ def find_clusters(points: Floats, moved: Bools) -> Ints:
     """
     found = np.full(len(points), -1)
     rows = np.flatnonzero(moved)
+    rows = rows[~_are_on_ground(points[rows], points[~moved])]
     if len(rows) < _MIN_POINTS:
         return found
     seeds = _components(points[rows], _LINK_M)
@@ -100,6 +103,28 @@ def find_clusters(points: Floats, moved: Bools) -> Ints:
         found[members] = number
         found[connected] = number
     return found
+
+
+def _are_on_ground(points: Floats, still: Floats) -> Bools:
+    """Mark the points that are hardly above the lowest stationary points around them.
+
+    Rays at a small angle to the ground seem to pass through points on it. All points are in the
+    world frame.
+    """
+    if not len(points) or not len(still):
+        return np.zeros(len(points), bool)
+    first = np.floor(np.minimum(points.min(axis=0), still.min(axis=0))[:2] / _GROUND_CELL_M) - 1
+    cells = np.floor(still[:, :2] / _GROUND_CELL_M) - first
+    own = (np.floor(points[:, :2] / _GROUND_CELL_M) - first).astype(np.int64)
+    cells = cells.astype(np.int64)
+    shape = np.maximum(cells.max(axis=0), own.max(axis=0)) + 2
+    lowest_m = np.full(shape, np.inf)
+    np.minimum.at(lowest_m, tuple(cells.T), still[:, 2])
+    around_m = np.full(len(points), np.inf)
+    for along in (-1, 0, 1):
+        for across in (-1, 0, 1):
+            around_m = np.minimum(around_m, lowest_m[own[:, 0] + along, own[:, 1] + across])
+    return np.asarray(points[:, 2] < around_m + _GROUND_M)
 
 
 def _connected(points: Floats, moved: Bools, members: Ints) -> Ints:
