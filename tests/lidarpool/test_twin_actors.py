@@ -104,6 +104,39 @@ def test_an_object_that_was_parked_is_present_before_it_starts(track):
     )
 
 
+def test_the_visible_part_of_a_stationary_hedge_is_no_object():
+    leaves = np.random.default_rng(6).uniform((0, 6, 0), (12, 7, 1.5), (700, 3))
+    parts = []
+    for number in range(20):  # a part of 3 m that shifts by 0.4 m per sweep
+        ahead_m = leaves[:, 0] - 0.4 * number
+        parts.append(moved_rays(number, leaves[(ahead_m > 0) & (ahead_m < 3)]))
+    assert not find_tracks(MovingRays.concatenate(parts), None, PERIOD_S)
+
+
+def test_leaves_that_move_together_are_an_object():
+    leaves = np.random.default_rng(6).uniform((0, 6, 0), (3, 7, 1.5), (175, 3))
+    parts = [moved_rays(number, leaves + np.array([0.4 * number, 0, 0])) for number in range(20)]
+    (track,) = find_tracks(MovingRays.concatenate(parts), None, PERIOD_S)
+    assert track.distance_m > 3
+
+
+def moved_rays(number, ends):
+    """Return rays of a sweep that end on a cluster of points that moved."""
+    count = len(ends)
+    return MovingRays(
+        np.full(count, number),
+        np.full(count, PERIOD_S * number),
+        np.tile(SENSOR, (count, 1)),
+        ends,
+        np.ones(count, bool),
+        np.ones(count, bool),
+        np.zeros(count, np.int64),
+        np.full(count, np.nan),
+        np.zeros(count, np.int64),
+        np.zeros(count, np.int64),
+    )
+
+
 @pytest.mark.parametrize("number", [22, 29])
 def test_a_sighting_before_the_previous_one_is_omitted(rays, number):
     """If an object is where sweeps begin and end, its times can be those of another revolution."""

@@ -20,7 +20,10 @@ from .moving_rays import MovingRays
 from .object_clusters import MIN_PATH_M, MIN_SWEEPS, ClusterTrack, bounding_boxes, track_clusters
 from .object_poses import Shape, Sighting, adjust_poses, first_poses, register, velocities_of
 from .object_tracks import ObjectTrack, in_any_box, rotate_z
+from .voxel_planes import cell_keys
 
+_VOXEL_M = 0.2  # edge length of the voxels in which points are counted
+_MAX_VOXEL_RATIO = 0.8  # maximum number of these voxels relative to a stationary object
 _AROUND_M = 1.0  # distance from a box within which the ground is sought
 _MAX_CLEARANCE_M = 0.5  # maximum height of the lowest points of an object above the ground
 _MIN_GROUND = 20  # minimum number of returns around an object
@@ -213,10 +216,32 @@ def _follow(
     times_s = np.array([one.time_s for one in sightings])
     poses = adjust_poses(sightings, np.column_stack(track.poses(times_s)))
     track = _boxed(sightings, poses)
-    if track.distance_m < MIN_PATH_M:
+    if track.distance_m < MIN_PATH_M or _voxel_ratio(sightings, poses) > _MAX_VOXEL_RATIO:
         return None
     track = _on_ground(track, rays)
     return _with_standstills(track)
+
+
+def _voxel_ratio(sightings: Sequence[Sighting], poses: Floats) -> float:
+    """Return the number of voxels with points in the object frame, relative to the world frame.
+
+    The points of a moving object fill fewer voxels in its own frame.
+    """
+    own = np.concatenate(_local_points(sightings, poses))
+    world = np.concatenate([one.points for one in sightings])
+    own_count, world_count = (
+        len(np.unique(cell_keys(points, _VOXEL_M))) for points in (own, world)
+    )
+    return own_count / world_count
+
+
+def _local_points(sightings: Sequence[Sighting], poses: Floats) -> list[Floats]:
+    """Return the points of each sighting in the object frame."""
+    velocities = velocities_of(np.array([one.time_s for one in sightings]), poses)
+    return [
+        one.local(pose, velocity)
+        for one, pose, velocity in zip(sightings, poses, velocities, strict=True)
+    ]
 
 
 def _with_standstills(track: ObjectTrack) -> ObjectTrack:
@@ -228,13 +253,7 @@ def _with_standstills(track: ObjectTrack) -> ObjectTrack:
 def _boxed(sightings: Sequence[Sighting], poses: Floats) -> ObjectTrack:
     """Return a track whose box encloses the points in their object frame."""
     times_s = np.array([one.time_s for one in sightings])
-    velocities = velocities_of(times_s, poses)
-    local = np.concatenate(
-        [
-            one.local(pose, velocity)
-            for one, pose, velocity in zip(sightings, poses, velocities, strict=True)
-        ]
-    )
+    local = np.concatenate(_local_points(sightings, poses))
     low, high = np.quantile(local, _EXTENT, axis=0)
     low[2] -= _CLEARANCE_M
     center = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
