@@ -346,6 +346,7 @@ def city():
 def test_moving_cars_are_simulated_as_they_were_recorded(city, source):
     found = twin(city, actors=source)
     moving = found.figures["held_out"]["moving"]
+    assert found.figures["vehicle_share"] == 0
     assert moving["rays"] > 2_000
     assert moving["median_abs_difference_m"] < 0.03
     assert moving["no_surface"] < 0.02

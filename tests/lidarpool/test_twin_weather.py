@@ -149,6 +149,16 @@ def test_returns_from_the_vehicle_are_found():
     assert (found & ~true).sum() < 0.05 * true.sum()
 
 
+@pytest.mark.parametrize("faster_m_s", [1.0, -1.5])
+def test_a_car_that_drives_alongside_is_not_the_vehicle(faster_m_s):
+    x = -8.0 - faster_m_s * END_S / 2
+    path = [[x, 2.8, 0.3], [x + (SPEED_M_S + faster_m_s) * END_S, 2.8, 0.3]]
+    beside = Actor(box("beside", (4.2, 1.8, 1.3)), Track([0, END_S], path))
+    recorded = RecordedSweeps.from_recording(open_recording(drive(street(beside))))
+    vehicle = find_vehicle_returns(recorded, find_poses(recorded, None))
+    assert not vehicle.are_found
+
+
 def test_a_sensor_without_a_visible_vehicle_has_none():
     recorded = RecordedSweeps.from_recording(open_recording(drive(street())))
     vehicle = find_vehicle_returns(recorded, find_poses(recorded, None))

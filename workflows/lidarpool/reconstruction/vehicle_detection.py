@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.numerics.arrays import Bools, Floats, Floats32
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 
 from ..clouds.rings import MIN_RINGS
@@ -35,6 +35,10 @@ _DILATION = 5  # size of the neighborhood of a cell
 # Maximum share of returns from the vehicle that registration tolerates. In a drive of 71 m with a
 # share of 0.03 %, they changed steps by less than 1 cm, and the last position by 3 mm.
 _MAX_IGNORED_SHARE = 0.0005
+_OUTLINE_M = 0.5  # minimum range difference between an object and what is behind its outline
+# Maximum number of cells in which a part of the vehicle is visible in some sweeps, relative to
+# those in which it is visible in nearly all sweeps.
+_MAX_SWEPT = 1.5
 _MIN_VOTES = 2  # minimum number of rays that pass through a cell of the vehicle
 
 
@@ -83,6 +87,30 @@ def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> Vehi
     constant = _is_constant(ranges_m)
     if not constant.any():
         return _vehicle(constant, ranges_m)
+    passing, confirming = _votes(recorded, poses, pairs, near)
+    is_passed = constant & (passing >= _MIN_VOTES) & (passing > 2 * confirming)
+    # Other sweeps cannot observe positions that the vehicle itself hides.
+    unknown = constant & (passing >= confirming)
+    is_passed = binary_propagation(is_passed, mask=unknown)
+    shortest_m = np.stack([_shortest_ranges(recorded.read(first), shape) for first, _ in pairs])
+    vehicle = _vehicle(_fixed_parts(is_passed, shortest_m), ranges_m)
+    if not vehicle.are_found:
+        return vehicle
+    found = sum(int(vehicle.contain(sweep).sum()) for sweep in near)
+    return vehicle._replace(share=found / sum(len(recorded.read(first)) for first, _ in pairs))
+
+
+def _votes(
+    recorded: RecordedSweeps,
+    poses: RecordedPoses,
+    pairs: Sequence[tuple[int, int]],
+    near: Sequence[Sweep],
+) -> tuple[Ints, Ints]:
+    """Count the returns of each cell that other sweeps passed, and those that they confirm.
+
+    `near` are the near returns of the first sweep of each pair. Both arrays have shape (r, c).
+    """
+    shape = (recorded.ring_count, VEHICLE_COLUMNS)
     passing, confirming = np.zeros((2, *shape), np.int64)
     for (first, second), sweep in zip(pairs, near, strict=True):
         cell = vehicle_cells(sweep.points, sweep.columns["row"])
@@ -90,14 +118,7 @@ def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> Vehi
         passed, confirmed = _observe(recorded, second, transform_points(sweep.points, moved))
         np.add.at(passing, cell, passed)
         np.add.at(confirming, cell, confirmed)
-    is_passed = constant & (passing >= _MIN_VOTES) & (passing > 2 * confirming)
-    # Other sweeps cannot observe positions that the vehicle itself hides.
-    unknown = constant & (passing >= confirming)
-    vehicle = _vehicle(binary_propagation(is_passed, mask=unknown), ranges_m)
-    if not vehicle.are_found:
-        return vehicle
-    found = sum(int(vehicle.contain(sweep).sum()) for sweep in near)
-    return vehicle._replace(share=found / sum(len(recorded.read(first)) for first, _ in pairs))
+    return passing, confirming
 
 
 def _observe(recorded: RecordedSweeps, number: int, points: Floats) -> tuple[Bools, Bools]:
@@ -162,6 +183,31 @@ def _is_constant(ranges_m: Floats32) -> Bools:
         low, high = np.nanquantile(ranges_m[:, often], (0.25, 0.75), axis=0)
         constant[often] = high - low < _MAX_SPREAD_M
     return constant
+
+
+def _fixed_parts(cells: Bools, shortest_m: Floats32) -> Bools:
+    """Omit connected parts of the cells whose outlines move, such as cars in the next lane.
+
+    The flat side of a car that drives alongside has a constant range, but its ends do not remain in
+    the same cells. `shortest_m` are the shortest ranges in all cells. Shape (k, r, c).
+    """
+    from scipy.ndimage import binary_dilation, binary_propagation, label
+
+    around = np.ones((_DILATION, _DILATION), bool)  # Cells without rays separate parts.
+    fixed = cells.copy()
+    with_missing = np.where(np.isnan(shortest_m), np.float32(np.inf), shortest_m)
+    count = len(with_missing)
+    nearest_first = np.sort(with_missing, axis=0)
+    low_m, high_m = nearest_first[count // 10], nearest_first[-1 - count // 10]
+    changes = high_m > low_m + _OUTLINE_M
+    parts, part_count = label(binary_dilation(cells, around))
+    for part in range(1, part_count + 1):
+        own = cells & (parts == part)
+        visible = own | (changes & (low_m < float(low_m[own].max()) + _OUTLINE_M))
+        swept = visible & binary_propagation(own, mask=binary_dilation(visible, around))
+        if swept.sum() > _MAX_SWEPT * own.sum():
+            fixed &= ~own
+    return fixed
 
 
 def _vehicle(cells: Bools, ranges_m: Floats32) -> VehicleReturns:
