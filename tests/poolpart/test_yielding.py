@@ -484,6 +484,8 @@ def test_partitions_in_different_queues_release_jobs_for_each(queue, wait_until)
         for part in parts:
             part.adapt(2, 2, idle_s=NEVER_S)
         wait_until(lambda: [len(part) for part in parts] == [2, 2])
+        workers = client.cluster.scheduler.workers
+        wait_until(lambda: all(worker.processing for worker in workers.values()))
         for part in parts:
             part.adapt(0, 2, idle_s=NEVER_S)
         wait_until(lambda: [part.stats().queue.releasing for part in parts] == [1, 1])
