@@ -190,7 +190,7 @@ def test_the_middle_of_a_long_vehicle_belongs_to_its_cluster():
 def test_ground_that_seems_to_move_does_not_belong_to_a_cluster():
     along, height = np.meshgrid(np.arange(0, 4, 0.1), np.arange(0.05, 1.5, 0.05))
     car = np.column_stack([along.ravel(), np.full(along.size, 4.0), height.ravel()])
-    ground = level_ground()
+    ground = np.append(level_ground(), [[1e5, 1e5, 0.0]], axis=0)  # and a point far away
     moved = (ground[:, 0] < 6) & (np.random.default_rng(1).random(len(ground)) < 0.5)
     cluster = find_clusters(
         np.concatenate([car, ground]), np.concatenate([np.ones(len(car), bool), moved])

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.numerics.arrays import Bools, Floats, Ints
+
+from .voxel_planes import cell_keys, smallest_by_cell
 
 _CELL_M = 0.15  # edge length of the cells that are linked
 _LINK_M = 0.7  # maximum distance between cells of points that moved in a cluster
@@ -106,24 +109,22 @@ def find_clusters(points: Floats, moved: Bools) -> Ints:
 
 
 def _are_on_ground(points: Floats, still: Floats) -> Bools:
-    """Mark the points that are hardly above the lowest stationary points around them.
+    """Mark the points that are at most `_GROUND_M` above the lowest stationary points nearby.
 
-    Rays at a small angle to the ground seem to pass through points on it. All points are in the
-    world frame.
+    Rays at a small angle to the ground seem to pass through points on it. `still` are the
+    stationary points. All points are in the world frame.
     """
     if not len(points) or not len(still):
         return np.zeros(len(points), bool)
-    first = np.floor(np.minimum(points.min(axis=0), still.min(axis=0))[:2] / _GROUND_CELL_M) - 1
-    cells = np.floor(still[:, :2] / _GROUND_CELL_M) - first
-    own = (np.floor(points[:, :2] / _GROUND_CELL_M) - first).astype(np.int64)
-    cells = cells.astype(np.int64)
-    shape = np.maximum(cells.max(axis=0), own.max(axis=0)) + 2
-    lowest_m = np.full(shape, np.inf)
-    np.minimum.at(lowest_m, tuple(cells.T), still[:, 2])
     around_m = np.full(len(points), np.inf)
-    for along in (-1, 0, 1):
-        for across in (-1, 0, 1):
-            around_m = np.minimum(around_m, lowest_m[own[:, 0] + along, own[:, 1] + across])
+    level = np.array([1.0, 1.0, 0.0])
+    cells, lowest_m = smallest_by_cell(cell_keys(level * still, _GROUND_CELL_M), still[:, 2])
+    for along, across in product((-1, 0, 1), repeat=2):
+        beside = level * points + _GROUND_CELL_M * np.array([along, across, 0])
+        keys = cell_keys(beside, _GROUND_CELL_M)
+        row = np.searchsorted(cells, keys).clip(max=len(cells) - 1)
+        is_known = cells[row] == keys
+        around_m[is_known] = np.minimum(around_m, lowest_m[row])[is_known]
     return np.asarray(points[:, 2] < around_m + _GROUND_M)
 
 

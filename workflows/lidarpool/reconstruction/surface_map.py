@@ -35,7 +35,7 @@ from .alignment import AlignedSweep, AlignedSweeps
 from .outlines import Extents, crossed_cells
 from .porosity import Crossings, Porosity
 from .surfels import Surfels
-from .voxel_planes import cell_keys
+from .voxel_planes import cell_keys, smallest_by_cell
 
 _ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
 _MAX_SHIFT_M = 0.3  # Rays with a larger range difference do not move a surfel.
@@ -429,15 +429,7 @@ def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> t
     for number, mask in stationary.items():
         sweep = sweeps.read(number)
         occupied = cell_keys(sweep.world[mask], _VIEW_CELL_M)
-        found, closest_m = _shortest(occupied, sweep.range_m[mask])
+        found, closest_m = smallest_by_cell(occupied, sweep.range_m[mask])
         cells.append(found)
         shortest_m.append(closest_m)
-    return _shortest(np.concatenate(cells), np.concatenate(shortest_m))
-
-
-def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
-    """Return the distinct cells in ascending order, and the shortest range in each of them."""
-    found, inverse = np.unique(cells, return_inverse=True)
-    shortest_m = np.full(len(found), np.inf)
-    np.minimum.at(shortest_m, inverse, range_m)
-    return found, shortest_m
+    return smallest_by_cell(np.concatenate(cells), np.concatenate(shortest_m))

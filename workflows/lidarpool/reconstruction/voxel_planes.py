@@ -28,6 +28,14 @@ def cell_keys(points: Floats, cell_m: float) -> Ints:
     return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])
 
 
+def smallest_by_cell(keys: Ints, values: Floats) -> tuple[Ints, Floats]:
+    """Return the distinct cells in ascending order, and the smallest value in each of them."""
+    cells, row = np.unique(keys, return_inverse=True)
+    smallest = np.full(len(cells), np.inf)
+    np.minimum.at(smallest, row, values)
+    return cells, smallest
+
+
 @dataclass(frozen=True, eq=False)
 class VoxelPlanes:
     """Mean points of voxels whose neighborhoods are planar."""

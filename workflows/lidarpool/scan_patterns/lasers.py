@@ -270,7 +270,7 @@ class _Offsets(NamedTuple):
 
     @property
     def are_certain(self) -> Bools:
-        """Whether the offset of each ring is known and plausible, of shape (r,)."""
+        """Mask of the rings whose offset is known and plausible. Shape (r,)."""
         return (self.errors_m < _MAX_ERROR_M) & (np.abs(self.values_m) < _MAX_OFFSET_M)
 
     def significant(self) -> tuple[Floats, Bools]:
