@@ -92,6 +92,7 @@ pipe.put(2) if sys.argv[1] == "put" else list(pipe)
 """
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("end", ["put", "get"])
 def test_a_client_dies_while_it_waits_at_a_pipe(end):
     program = [sys.executable, "-c", WAIT_AT_PIPE, end]

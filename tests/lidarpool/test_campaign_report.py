@@ -165,6 +165,7 @@ def test_unknown_casting_times_are_empty(tmp_path):
     assert "The casting times of the jobs are unknown." in page
 
 
+@pytest.mark.extended
 def test_the_card_counts_jobs_in_which_a_quantity_is_not_set(tmp_path):
     unset = {"visibility": None, "model": "vlp16", "night": None}
     rows = [row(0), *(row(k, values=unset) for k in range(1, 20))]

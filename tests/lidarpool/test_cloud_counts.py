@@ -93,12 +93,13 @@ def test_a_picture_from_above_has_a_point_or_two_in_a_pixel():
     counts = CloudCounts([], 1, 0, 0.001, np.array([100.0, 0, 0]))
     counts.widen(box_of(cells))
     counts.add_positions(list(cells.T))
-    rows, columns = counts.above.shape
-    assert counts.above.sum() == len(cells)
+    above, corner, pixel_m = counts.top_view()
+    rows, columns = above.shape
+    assert above.sum() == len(cells)
     assert 100 <= rows <= 201 and 100 <= columns <= 201
-    assert counts.pixel_m == pytest.approx(40 / columns, rel=0.05)
-    x, y = ((cells[:, :2] * 0.001 + [100, 0] - counts.corner) // counts.pixel_m).astype(int).T
+    assert pixel_m == pytest.approx(40 / columns, rel=0.05)
+    x, y = ((cells[:, :2] * 0.001 + [100, 0] - corner) // pixel_m).astype(int).T
     expected = np.zeros((rows, columns), int)
     np.add.at(expected, (y, x), 1)
-    assert abs(expected - counts.above).sum() <= 2 * len(cells) * 0.001 / counts.pixel_m * 4
+    assert abs(expected - above).sum() <= 2 * len(cells) * 0.001 / pixel_m * 4
     assert counts.bounds == pytest.approx(np.array([[100, 0, 0], [140, 40, 40]]), abs=0.1)

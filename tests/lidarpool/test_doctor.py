@@ -72,6 +72,7 @@ def test_a_port_that_is_in_use(monkeypatch):
         assert any(f"{port} " in line and "in use (a test)" in line for line in lines)
 
 
+@pytest.mark.extended
 def test_extras_are_added_in_the_checkout(monkeypatch):
     monkeypatch.setattr(installation, "find_spec", lambda name: "a spec")
     at = "in a checkout of lidarpool (docs/install.md#extras)"

@@ -531,6 +531,7 @@ def test_intensities_of_unknown_scale_need_the_white_one():
     assert found.figures["figures"]["detection_range_m"]["value"] == pytest.approx(10, rel=0.03)
 
 
+@pytest.mark.extended
 def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
     def cut(number):
         sweep = recording.read(number)
@@ -686,6 +687,7 @@ def test_an_hdl64e_is_read_by_the_calibration_in_its_packets(model, tmp_path):
 ROOM_CAPTURES = variants(round_room())
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", ROOM_CAPTURES)
 def test_a_velodyne_is_read_from_any_capture(name, tmp_path):
     pytest.importorskip("velodyne_decoder")
@@ -698,6 +700,7 @@ def test_a_velodyne_is_read_from_any_capture(name, tmp_path):
     assert opened.stamps_ns == pytest.approx(plain.stamps_ns, rel=0, abs=2000)
 
 
+@pytest.mark.extended
 def test_a_kitti_sequence_is_fitted_by_the_rings_in_its_points(cluster_client, tmp_path):
     survey = Survey(
         Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120), poses=[(0, 0, 0)] * 4,

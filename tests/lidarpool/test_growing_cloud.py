@@ -51,7 +51,8 @@ def grown_at(path):
 
 def counted(counts):
     """All figures of counts, to compare them."""
-    arrays = (counts.by_object, counts.by_class, counts.by_material, counts.above, counts.bounds)
+    view = counts.top_view().counts
+    arrays = (counts.by_object, counts.by_class, counts.by_material, view, counts.bounds)
     return [counts.limits, counts.density, counts.no_surface, *(a.tolist() for a in arrays)]
 
 
@@ -126,6 +127,7 @@ def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, 
     assert not {thread.name for thread in threading.enumerate() if "cloud" in thread.name}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("far_first", [0, 5, 10])
 def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_first):
     with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:

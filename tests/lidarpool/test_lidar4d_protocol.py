@@ -283,6 +283,7 @@ def test_lpips_gets_clipped_images_if_it_is_installed(pair, torch, monkeypatch):
     assert depth.min() == np.float32(1e-6) and 70 < depth.max() <= 80
 
 
+@pytest.mark.extended
 def test_intensities_have_the_full_scale_of_their_recording(pair):
     highest = (0.5, 1, 200, 256, 70_000)
     scales = [full_scale_of(np.array([value]), are_energies=False) for value in highest]

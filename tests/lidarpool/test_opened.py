@@ -248,6 +248,7 @@ def test_the_coordinate_system_of_a_file_is_told(tmp_path, comment, epsg):
     assert state_of(open_view(tmp_path / "a.ply"))["epsg"] == epsg
 
 
+@pytest.mark.extended
 def test_a_mesh_and_a_scenario_are_previews_of_their_run(tmp_path):
     (tmp_path / "wall.obj").write_text("v 5 -5 0\nv 5 5 0\nv 5 5 4\nv 5 -5 4\nf 1 2 3 4\n")
     (tmp_path / "drive.yaml").write_text(

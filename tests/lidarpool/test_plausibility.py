@@ -80,6 +80,7 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
     return plausibility_warnings(prepare(Scenario.from_data(scenario, folder=folder), plans=False))
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("meshes", "position", "warning", "free"),
     [

@@ -259,6 +259,7 @@ steps: 36
 """
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("scenario", "options", "words"),
     [

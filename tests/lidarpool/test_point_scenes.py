@@ -197,6 +197,7 @@ INTENSITIES = np.tile([10, 20, 60], len(GRID))
 COLORS = np.tile([[100, 0, 0], [100, 0, 50], [100, 0, 100]], (len(GRID), 1)).astype(np.uint8)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd", "text.pcd", "a.las", "a.e57"])
 def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
     points = plane().repeat(3, axis=0)
@@ -359,6 +360,7 @@ def ptx_scan(x, cells):
     return head + "".join(f"{x} {y:.6f} {z:.6f} {cells}\n" for y, z in GRID + 1)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("first", "second", "quantity"),
     [("0.5 200 200 200", "0.5", "color"), ("0.5 200 200 200", "0.5 0 0 0", "color"),

@@ -179,6 +179,7 @@ def test_a_capture_has_the_same_points_between_other_bounds(result):
         np.testing.assert_allclose(np.ptp(sweep.times_s), np.ptp(since_s), atol=0.11)
 
 
+@pytest.mark.extended(keep=("standing-*",))
 def test_views_are_the_same_for_every_format(result, exported):
     cloud, _, stands = result
     _, path, losses = exported
@@ -193,6 +194,7 @@ def test_views_are_the_same_for_every_format(result, exported):
             np.testing.assert_array_equal(shown[column], cloud.columns[column][rows])
 
 
+@pytest.mark.extended(keep=("moving-*",))
 def test_comparisons_with_the_result_find_no_difference(result, exported):
     cloud, _, stands = result
     name, path, losses = exported
@@ -209,6 +211,7 @@ def test_comparisons_with_the_result_find_no_difference(result, exported):
         assert figures["ranges"]["no_return"]["f1"] > 0.999
 
 
+@pytest.mark.extended(keep=("standing-*",))
 def test_fits_and_twins_find_the_same_rings(result, exported):
     cloud, _, stands = result
     name, path, losses = exported
@@ -235,6 +238,7 @@ def test_fits_and_twins_find_the_same_rings(result, exported):
         np.testing.assert_array_equal(np.sort(stack.rings), np.unique(channels))
 
 
+@pytest.mark.extended(keep=("moving-*",))
 @pytest.mark.parametrize("name", CLOUDS)
 def test_clouds_without_sweeps_have_the_same_points(result, name):
     cloud, folder, _ = result
@@ -252,6 +256,7 @@ def test_clouds_without_sweeps_have_the_same_points(result, name):
     assert compare(path, cloud).figures["distances"]["a_to_b"]["max_m"] < 1e-6
 
 
+@pytest.mark.extended(keep=("moving-*",))
 @pytest.mark.parametrize("name", ["pcd", "e57", "las", "kitti"])
 def test_scenes_are_made_of_the_same_points(result, name):
     """A single file of a format: its first sweep, or all scans in the frame of the file."""

@@ -156,6 +156,7 @@ def in_the_sensor(survey: Survey, points: Cloud, sensor: int, times_ns: np.ndarr
     return (on_vehicle - mount.position) @ (np.eye(3) if mount.rotation is None else mount.rotation)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("compensated", [False, True])
 @pytest.mark.parametrize("layout", DRIVERS)
 def test_each_field_of_a_point_is_that_of_the_driver(layout, compensated, tmp_path):

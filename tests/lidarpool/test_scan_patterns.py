@@ -95,6 +95,7 @@ def errors_of(sensor, found):
     return apart_deg.max(), apart_ns.max()
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     ("name", "condition"),
     [
@@ -116,6 +117,7 @@ def test_a_spinning_sensor_is_recovered(room, tmp_path, name, condition):
     assert max(fitted.figures["elevation_spread_deg"]) < 0.005
 
 
+@pytest.mark.extended
 def test_the_direction_of_rotation_is_recovered(room, tmp_path):
     beams = load_sensor("velodyne/vlp16").beams
     sensor = Sensor(beams, Spin(900, rate_hz=20, zero_deg=37), max_range_m=100)
@@ -126,6 +128,7 @@ def test_the_direction_of_rotation_is_recovered(room, tmp_path):
     assert errors_of(sensor, found)[0] < MAX_ERROR_DEG
 
 
+@pytest.mark.extended
 def test_without_times_the_order_of_points_reveals_azimuth_offsets(room, tmp_path):
     sensor = load_sensor("ouster/os1-64", columns=512)
     fitted = fit_pattern(record(room, sensor, columns=["channel"], are_stamped=False))
@@ -135,6 +138,7 @@ def test_without_times_the_order_of_points_reveals_azimuth_offsets(room, tmp_pat
     assert "10 Hz are assumed" in notes
 
 
+@pytest.mark.extended
 def test_without_times_a_revolution_need_not_be_a_whole_number_of_firings(room):
     fitted = fit_pattern(record(room, load_sensor("velodyne/vlp16"), columns=["channel"]))
     assert fitted.figures["firings_per_turn"] == pytest.approx(1808.449, abs=0.01)
@@ -158,6 +162,7 @@ def test_points_sorted_by_ring_lack_whole_azimuth_steps(room):
     assert fitted.figures["clockwise"]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "name", ["livox/mid360", pytest.param("livox/avia", marks=pytest.mark.extended)]
 )
@@ -233,6 +238,7 @@ def test_a_single_sweep_cannot_show_motion(room):
     assert "motion cannot be detected in a single sweep" in repr(fitted)
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(("height_m", "uncertain"), [(1, 15), (8, 0)])
 def test_rings_with_a_single_range_are_uncertain(height_m, uncertain):
     """At a height of 1 m, the lower rings only see the floor, and their lasers are 35 mm away."""

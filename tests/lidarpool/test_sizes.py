@@ -102,6 +102,7 @@ def test_columns_of_parquet_that_are_no_numbers_are_not_read(tmp_path):
     assert "its coordinate columns are not numeric: y" in refused(open_recording, path)
 
 
+@pytest.mark.extended
 def test_a_data_set_of_parquet_is_limited_by_its_files(tmp_path, strict):
     pytest.importorskip("pyarrow", reason="pyarrow is an extra")
     scene = the_scene()

@@ -99,6 +99,7 @@ STRETCHED = {  # {case: (system of the coordinates, records, what the message sa
 } if find_spec("rasterio") else {}  # fmt: skip
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("case", STRETCHED)
 def test_stretched_meters_are_refused_with_what_helps(tmp_path, case):
     system, records, message = STRETCHED[case]
@@ -331,6 +332,7 @@ def e57_with(monkeypatch, path, metadata, points):
     return path
 
 
+@pytest.mark.extended
 def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     text = CRS.from_epsg(3857).to_wkt(version="WKT2_2019")
     path = e57_with(monkeypatch, tmp_path / "a.e57", text, ground("EPSG:3857"))

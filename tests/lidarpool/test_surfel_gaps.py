@@ -26,6 +26,7 @@ def wall_of_squares(half_m):
     return points, corners
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("half_m", [0.01, 0.025, 0.04, 0.05])
 @pytest.mark.parametrize("origin", [(0, 0, 0), (500_000, 5_400_000, 300)])
 def test_the_loss_is_the_area_between_surfels(half_m, origin):
@@ -69,6 +70,7 @@ def hall(tmp_path_factory):
     return scene, place, path
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("voxel_m", [None, 0.7])
 def test_the_loss_is_that_of_a_scan_from_the_same_place(hall, voxel_m):
     scene, place, path = hall

@@ -64,7 +64,7 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
     return sweep.job_number, sweep.sensor, sweep.number
 
 
-@pytest.mark.extended(every=2)
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     "name", [*DATA_SETS, *(f"mcap-{layout}" for layout in LAYOUTS if layout != "velodyne")]
 )

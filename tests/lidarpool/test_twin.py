@@ -506,6 +506,7 @@ def test_kept_sweeps_need_half_the_memory(drive, tmp_path):
     assert kept_bytes < 0.5 * sum(values.nbytes for values in arrays)
 
 
+@pytest.mark.extended
 def test_other_processes_read_sweeps_without_another_analysis(drive, tmp_path, monkeypatch):
     for name in ("drive.mcap", "another.mcap"):
         save_cloud(drive, tmp_path / name)

@@ -137,6 +137,7 @@ def moved_rays(number, ends):
     )
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("number", [22, 29])
 def test_a_sighting_before_the_previous_one_is_omitted(rays, number):
     """If an object is where sweeps begin and end, its times can be those of another revolution."""

@@ -97,6 +97,7 @@ def drive():
     return city_drive(MODEL, {"columns": COLUMNS}, SWEEPS, at_10_m_s)
 
 
+@pytest.mark.extended
 def test_the_directions_that_a_vehicle_blocks_are_found(drive):
     assert_sectors_match(find_sectors(fired(drive, beside_body)), BODY)
 

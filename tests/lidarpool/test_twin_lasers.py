@@ -110,6 +110,7 @@ def test_noisy_directions_still_show_the_offsets():
     assert np.median(np.abs(found.vertical_m - truth.vertical_m)) < 2e-3
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("noise_deg", [0.0, 0.02, 0.1])
 def test_lasers_at_the_origin_stay_there(noise_deg):
     truth, azimuth = true_lasers()

@@ -55,10 +55,12 @@ def noisy_room(sigma_m, pose_error_m=0.0, bias_m=0.0):
     return AlignedSweeps(replace(recorded), alignment, coverage)
 
 
+@pytest.mark.extended
 def test_ranges_without_noise_have_none():
     assert estimate_range_noise(noisy_room(0.0), range(4)).range_m < 2e-4
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("sigma_m", [0.005, 0.02, 0.04])
 def test_the_range_noise_is_known_despite_errors_of_the_map(sigma_m):
     sweeps = noisy_room(sigma_m, pose_error_m=0.02, bias_m=0.02)
@@ -123,6 +125,7 @@ def test_the_sensor_of_a_twin_has_the_errors_of_the_rings(calibrated, tmp_path):
     assert np.ptp(error_deg) < 0.2
 
 
+@pytest.mark.extended
 def test_the_sensor_of_a_twin_has_the_recorded_ranges(calibrated, tmp_path):
     aligned, _, bias_m = calibrated
     sensor = written_sensor(aligned, tmp_path)

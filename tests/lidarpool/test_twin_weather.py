@@ -133,6 +133,7 @@ def test_clear_air_returns_nothing():
     assert not found.any()
 
 
+@pytest.mark.extended
 def test_returns_from_the_vehicle_are_found():
     hood = Actor(box("hood", HOOD), ahead((-8.5, 0), 0.7))
     cloud = drive(street(hood))
@@ -149,6 +150,7 @@ def test_returns_from_the_vehicle_are_found():
     assert (found & ~true).sum() < 0.05 * true.sum()
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("faster_m_s", [1.0, -1.5])
 def test_a_car_that_drives_alongside_is_not_the_vehicle(faster_m_s):
     x = -8.0 - faster_m_s * END_S / 2
@@ -159,6 +161,7 @@ def test_a_car_that_drives_alongside_is_not_the_vehicle(faster_m_s):
     assert not vehicle.are_found
 
 
+@pytest.mark.extended
 def test_a_sensor_without_a_visible_vehicle_has_none():
     recorded = RecordedSweeps.from_recording(open_recording(drive(street())))
     vehicle = find_vehicle_returns(recorded, find_poses(recorded, None))

@@ -392,6 +392,7 @@ class Kept(Viewer):
         self.closed = True
 
 
+@pytest.mark.extended
 def test_a_run_shows_its_finished_sweeps_and_its_path(room, monkeypatch):
     viewer = Kept()
     monkeypatch.setattr("lidarpool.pages.viewer_page.open_viewer", lambda *_, **__: viewer)

@@ -246,6 +246,7 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
         Scene.load(path, transform=uneven)
 
 
+@pytest.mark.extended
 def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
     scenes = tmp_path / "scenes"
     scenes.mkdir()

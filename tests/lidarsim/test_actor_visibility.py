@@ -77,6 +77,7 @@ def street():
     return Scene.from_meshes([level("Ground", -1), fence]).with_actors(actors)
 
 
+@pytest.mark.extended
 def test_counts_and_distances_by_brute_force():
     scene = street()
     path = turning(2.0, 1.5)

@@ -164,6 +164,7 @@ def check_refusals(path, says, tmp_path, capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", NPZ)
 def test_damaged_npz(name, tmp_path, capfd):
     content, says = NPZ[name]
@@ -172,6 +173,7 @@ def test_damaged_npz(name, tmp_path, capfd):
     check_refusals(path, says, tmp_path, capfd)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", TEXTS)
 def test_damaged_texts(name, tmp_path, capfd):
     text, says = TEXTS[name]
@@ -213,6 +215,7 @@ PARQUET = {
 }
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("name", PARQUET)
 def test_damaged_parquet(name, tmp_path, capfd):
     pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
@@ -235,6 +238,7 @@ def test_a_damaged_cloud_of_parquet_is_refused_in_a_line(tmp_path):
     assert len(str(raised.value).splitlines()) == 1
 
 
+@pytest.mark.extended
 def test_the_rows_of_parquet_are_limited_before_they_are_read(tmp_path):
     """A file of 6 kB with 40 million rows, which took gigabytes."""
     pa = pytest.importorskip("pyarrow", reason="the extra parquet is not installed")

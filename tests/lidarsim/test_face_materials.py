@@ -555,6 +555,7 @@ def test_copies_have_their_class_on_all_materials(house):
     assert found["Annex.2", "Glass"] == found["Annex.2", "Brick"] == (8, 0.5)
 
 
+@pytest.mark.extended
 def test_names_of_materials_are_in_reports_and_files(cluster_client, house, tmp_path):
     scene = Scene.load(house, materials=True)
     what = replace(survey(), columns=(*COLUMNS, "time", "intensity"))

@@ -280,6 +280,7 @@ def check(payloads, model, mode):
     assert abs(rows[:, 6] - expected[:, 6]).max() <= 0.505
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(("model", "mode"), CASES)
 def test_packets_hold_the_returns_of_the_cloud(model, mode):
     check(payloads_of(model, mode), model, mode)

@@ -96,6 +96,7 @@ def test_an_at128_fires_in_the_directions_of_its_driver():
     assert sensor.beams.time_ns.max() == 14_928
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("name", "field", "rate"),
     [

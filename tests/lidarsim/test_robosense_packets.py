@@ -234,6 +234,7 @@ def check(payloads, model, mode):
     assert abs(rows[:, 6] - expected[:, 6]).max() < 1.1
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(("model", "mode"), CASES)
 def test_packets_hold_the_returns_of_the_cloud(model, mode):
     check(payloads_of(model, mode), model, mode)

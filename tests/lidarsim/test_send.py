@@ -163,6 +163,7 @@ def _is_running(pid):
         return False
 
 
+@pytest.mark.extended
 def test_the_process_stops_reading_when_many_bytes_wait():
     """So that a producer that is ahead of time waits, and memory is bounded."""
     body = bytes(1 << 20)

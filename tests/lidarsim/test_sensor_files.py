@@ -72,6 +72,7 @@ def test_rays_of_a_revolution_are_in_the_order_of_their_times():
     assert len(half) == 360 and not half.repeats
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("ending", TABLES)
 def test_tables_of_rays_come_back_as_the_same_rays(ending, tmp_path):
     sensor = load_sensor("velodyne/hdl32e", max_range_m=77)  # its data sheet states no divergence
@@ -368,6 +369,7 @@ def OmniLidar "Lidar" (
 """
 
 
+@pytest.mark.extended
 def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
     pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
     path = tmp_path / "lidar.usda"
@@ -386,6 +388,7 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
         read_omnilidar(path)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize(
     ("window", "lowest_deg", "highest_deg", "rays"),
     [
@@ -409,6 +412,7 @@ def test_rotary_omnilidars_return_within_a_window(window, lowest_deg, highest_de
     assert sensor.unsupported == ["channels (a ray list has one channel)"]
 
 
+@pytest.mark.extended
 def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
     pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
     lines = """

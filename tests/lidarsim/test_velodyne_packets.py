@@ -185,6 +185,7 @@ def read_offsets(model):
     return np.array(beams.azimuth_deg or [0.0] * len(beams.elevation_deg))
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(("model", "mode"), CASES)
 def test_packets_hold_the_returns_of_the_cloud(model, mode):
     check(payloads_of(model, mode), model, mode)

@@ -30,6 +30,7 @@ SHOWN = {
 }
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.slow(every=4)
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_cell_has_a_table_and_a_small_picture(name):

@@ -131,6 +131,7 @@ def test_a_room_is_cut_open_at_its_top():
     assert reds(next(opened.frames()).astype(int)) > 1000
 
 
+@pytest.mark.extended
 @pytest.mark.slow(every=2)
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_a_film_moves_and_is_the_same_each_time(drive, tmp_path, suffix):

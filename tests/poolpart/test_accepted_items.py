@@ -246,6 +246,7 @@ def count_to(pipe, number, many):
     pipe.close()
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("many", [True, False])
 def test_a_producer_that_is_killed_while_it_waits_sends_each_item_once(processes, make_pipe, many):
     pipe = make_pipe(processes, capacity=20)

@@ -158,6 +158,7 @@ def test_submitted_tasks_attract_workers_in_bursts(eight, quickly, wait_until):
             assert eight.gather(tasks) == [None] * 300
 
 
+@pytest.mark.extended
 def test_bounds_of_each_partition_and_of_its_rule(eight, quickly, wait_until):
     rules = {"A": n_workers(3), "B": n_workers(4, minimum=3), "C": n_workers(1)}
     a, b, c = parts = list(Pool.from_client(eight).divide(rules).values())
@@ -200,6 +201,7 @@ def test_workers_with_gpus_are_not_interchangeable_with_others(
     assert {worker.name for part in (a, gpu) for worker in part.workers} == {"g", "h"}
 
 
+@pytest.mark.extended
 def test_only_the_named_workers_are_moved(eight, quickly, wait_until):
     pool = Pool.from_client(eight)
     a, _ = pool.partition("A", workers=list("abcd"))
@@ -306,6 +308,7 @@ def test_a_group_that_was_stopped_moves_no_workers(eight, quickly):
     assert len(b) == 4
 
 
+@pytest.mark.extended
 def test_balancing_again_replaces_the_bounds(eight, quickly, wait_until):
     a, b = parts = divide(eight, A=4, B=4)
     balance(eight, parts, max=4)
@@ -314,6 +317,7 @@ def test_balancing_again_replaces_the_bounds(eight, quickly, wait_until):
     assert BALANCER not in eight.cluster.scheduler.plugins
 
 
+@pytest.mark.extended(every=5)
 @pytest.mark.parametrize(
     ("names", "options", "message"),
     [
@@ -371,6 +375,7 @@ def test_a_refused_group_changes_no_partition(start):
     assert list(pool.partitions()) == ["B"]  # A has not become a partition with a rule
 
 
+@pytest.mark.extended
 def test_a_partition_that_is_created_again_is_not_balanced(eight, quickly, wait_until):
     a, b, c = parts = divide(eight, A=2, B=2, C=4)
     with balance(eight, parts) as group:
@@ -439,6 +444,7 @@ def moving(client, parts, wait_until):
     client.gather(held)
 
 
+@pytest.mark.extended
 def test_partitions_are_dissolved_while_a_worker_is_moved(start, quickly, wait_until):
     client = start({name: {} for name in "abcd"})
     pool = Pool.from_client(client)
@@ -520,6 +526,7 @@ def test_moves_are_shown_on_the_page_and_logged(eight, quickly, wait_until, capl
     assert len(b) < 4
 
 
+@pytest.mark.extended
 def test_prometheus_reads_the_shares_and_the_moves(eight, quickly, wait_until):
     a, _ = parts = divide(eight, A=4, B=4)
     with balance(eight, parts, min=2) as group:

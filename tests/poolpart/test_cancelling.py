@@ -105,6 +105,7 @@ def put_and_sleep(pipe):
     time.sleep(3600)
 
 
+@pytest.mark.extended
 def test_the_pipe_of_a_producer_whose_worker_is_restarted_fails(processes, make_pipe):
     gpu = Partition("GPU", processes)
     pipe = make_pipe(processes)

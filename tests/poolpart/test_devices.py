@@ -128,6 +128,7 @@ def nameless(tmp_path):
             client.sync(end, nannies)
 
 
+@pytest.mark.extended
 def test_a_worker_without_a_name_that_its_nanny_starts_again(nameless, wait_until):
     client = nameless
     part, _ = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)

@@ -131,6 +131,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.extended
 def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
     """A process that is stopped keeps its connections open."""
     scheduler = subprocess.Popen(

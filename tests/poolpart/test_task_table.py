@@ -95,6 +95,7 @@ def test_the_time_of_a_running_task(part, wait_until):
     assert later.seconds > task.seconds
 
 
+@pytest.mark.extended
 def test_only_the_last_that_have_ended_are_kept(part):
     part.tasks()
     futures = part.client.map(

@@ -66,6 +66,7 @@ def begin_and_wait(event):
     return wait_for(event)
 
 
+@pytest.mark.extended
 def test_a_job_ends_after_its_task_and_is_replaced_when_no_other_waits(queue, wait_until):
     waiting = [0]
 

@@ -217,6 +217,7 @@ def test_an_inner_function_is_compiled_once_for_all_whole_numbers():
     assert count(3) == 3 and len(more.overloads) == 1
 
 
+@pytest.mark.extended
 def test_compiling_is_told_once_and_not_when_loops_are_loaded(package):
     tell = (
         "import logging, sys; import raybeam.compiled as c; c._LOG_AFTER_S = 1e-9; "

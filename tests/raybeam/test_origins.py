@@ -84,6 +84,7 @@ def test_more_scattered_origins(seed, backend, nested):
     check_origins(seed, backend, nested=nested)
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("nested", [False, True], ids=["mesh", "instances"])
 @pytest.mark.parametrize("sizes_away", [0.5, 1.2, 1.9, 2.1, 5, 1e3, 1e6])
 def test_patterns_from_outside(backend, nested, sizes_away):

@@ -124,6 +124,7 @@ def ties(backend):
     return found.hexdigest()
 
 
+@pytest.mark.extended
 def test_the_lowest_of_equals_wins():
     assert ties("tiles") == ties("numpy")
 
@@ -133,6 +134,7 @@ def run_python(code, *arguments, **environment):
     subprocess.run([sys.executable, "-c", code, *arguments], check=True, env=given, timeout=300)
 
 
+@pytest.mark.extended
 def test_forked_processes_cast_too():
     """Workers are forked from a process that may have cast: threads do not survive that."""
     run_python(

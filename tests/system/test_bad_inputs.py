@@ -303,6 +303,7 @@ partitions: {GPU: {workers: 2}, LIDAR: {slots: 4}, OTHER: {}}
 """
 
 
+@pytest.mark.extended
 def test_jobs_that_do_not_begin_are_cancelled(place, refused, monkeypatch):
     job = import_jobqueue().slurm.SLURMJob
     submitted: list[str] = []

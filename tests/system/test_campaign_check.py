@@ -52,6 +52,7 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     assert not (campaign.parent / "out").exists()
 
 
+@pytest.mark.extended
 def test_a_result_in_the_output_folder_is_not_compared_with_each_job(campaign, lidarpool):
     out = campaign.parent / "out"
     (out / "jobs").mkdir(parents=True)
@@ -78,6 +79,7 @@ def test_a_campaign_has_no_pace(campaign, lidarpool, options, word):
     assert not (campaign.parent / "ds").exists()
 
 
+@pytest.mark.extended
 def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
     assert found["can_run"] and (found["count"], found["checked"]) == (9, 5)

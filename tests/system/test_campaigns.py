@@ -381,6 +381,7 @@ def third_if(there: Path, made: list[int]) -> Callable[[int, np.random.Generator
     return make_if_there
 
 
+@pytest.mark.extended
 def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     there = tmp_path / "there"
     made = []

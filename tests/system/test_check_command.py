@@ -148,6 +148,7 @@ def test_it_tells_what_a_run_would_do_and_starts_nothing(check, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
 
 
+@pytest.mark.extended
 def test_the_performance_of_each_sensor_is_named(check):
     assert "\nperformance ideal\n" in check().out
     vlp16 = {"model": "velodyne/vlp16"}
@@ -221,6 +222,7 @@ def test_objects_with_masks_are_named(check, tmp_path):
     assert "have masks" not in check(text=json.dumps(scenario)).out
 
 
+@pytest.mark.extended
 def test_objects_that_sensors_do_not_see_are_named(check):
     names = list(Scene.seed().names)
     seats = {"front": {"unseen": [names[0], names[1]]}, "rear": {}, "blind": {"unseen": "*"}}
@@ -250,6 +252,7 @@ def test_a_disk_without_room(check, monkeypatch):
     assert "The scenario can be run" not in outcome.out
 
 
+@pytest.mark.extended
 def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
     kept = {"cloud": {"columns": ["intensity", "time"]}}  # as the layout would
     plain = json.loads(check("--json", text=json.dumps(SHORT | kept)).out)

@@ -179,6 +179,7 @@ def test_a_path_that_there_is_not(run):
     assert "no collision-free path was found; no path is possible" in outcome.out
 
 
+@pytest.mark.extended
 def test_a_run_that_hits_nothing_says_so(run):
     outcome = run(text="scene: seed\nsteps: 1\nposes: [[0, 0, 1000]]\n")
     assert outcome.code == 0

@@ -95,6 +95,7 @@ def _pause(client: Client, name: str, *, on: bool) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.extended
 def test_a_worker_that_dask_has_paused_gets_no_batches(
     client, undisturbed, small_batches, same_cloud
 ):

@@ -136,7 +136,7 @@ def in_threads(monkeypatch, cluster_client):
     monkeypatch.setattr(lidarpool.run.cluster.cluster, "local_client", lambda *_, **__: ours)
 
 
-@pytest.mark.extended(every=4)
+@pytest.mark.extended(every=8)
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
 def test_python_runs(tmp_path, block, in_threads, capsys, monkeypatch):
     compile(block.code, block.where, "exec")

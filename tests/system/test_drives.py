@@ -81,6 +81,7 @@ def town(tmp_path):
     return tmp_path
 
 
+@pytest.mark.extended
 def test_what_check_says_of_a_drive(town, lidarpool):
     told = lidarpool("check", town / "drive.yaml", "--out", town / "out").out
     assert re.search(r"144 scans \(4 sweeps\) along a trajectory, .* \(2 sensors\)", told)

@@ -105,6 +105,7 @@ def test_the_reason_is_the_most_likely_one(run, changed, reason):
     assert warning.startswith("the cloud has no points: ") and reason in warning
 
 
+@pytest.mark.extended
 def test_check_gives_the_same_reason(tmp_path, lidarpool):
     sensor = SURVEY["sensor"] | {"min_range_m": 500}
     (tmp_path / "s.yaml").write_text(json.dumps(SURVEY | {"sensor": sensor, "poses": [[0, 0, 1]]}))

@@ -153,6 +153,7 @@ def test_ctrl_c_while_the_workers_start(start, untouched):
     assert untouched()
 
 
+@pytest.mark.extended
 def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypatch):
     """It is not said that nothing has happened, and there is nothing to resume."""
     replace = Path.replace

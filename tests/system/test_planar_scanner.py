@@ -66,6 +66,7 @@ def expected(angles: np.ndarray, yaw_deg: float, x: float) -> np.ndarray:
         return np.minimum(across, np.where(sin > 0, 4, -4) / sin)
 
 
+@pytest.mark.extended
 def test_a_run_writes_laser_scans_beside_points(folder, lidarpool, slots):
     scenario = SCANNER | {
         "cloud": {"columns": ["intensity"]},

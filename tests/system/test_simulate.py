@@ -188,6 +188,7 @@ def test_frames_have_their_hits_on_each_triangle(cluster_client):
             simulate(scene, other, client=cluster_client, on_frame=lambda f: f.hit_counts())
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("kind", ["scans", "news", "generate-0", "sort-1", "collect-0-2"])
 def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, plain, kind):
@@ -234,6 +235,7 @@ def raise_at(scan: int | str | None, scan_of=None):
     return fail
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("target", "stand_in", "message"),
     [

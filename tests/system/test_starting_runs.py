@@ -76,6 +76,7 @@ def lose_gpu(monkeypatch) -> Callable[[Callable[[], object]], None]:
     return lose_gpu
 
 
+@pytest.mark.extended
 def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
     def kill_all() -> None:
         for worker in Pool.from_client(client).partitions()["GPU"].workers:

@@ -91,6 +91,7 @@ def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, 
             assert all(np.array_equal(one[name], two[name]) for name in one)
 
 
+@pytest.mark.extended
 def test_normals_and_origins_are_in_the_axes_of_the_points(client):
     normal_names = ["normal_x", "normal_y", "normal_z"]
     origin_names = ["origin_x", "origin_y", "origin_z"]
@@ -180,6 +181,7 @@ def test_no_workers_are_started_in_a_task(cluster_client):
     task.release()  # the error has frames that hold it
 
 
+@pytest.mark.extended
 def test_one_that_is_left_early_leaves_nothing(client, left_over):
     before = {child.pid for child in psutil.Process().children(recursive=True)}
     for sweep in campaign().stream(gpu_workers=1):

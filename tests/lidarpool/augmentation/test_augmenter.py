@@ -361,6 +361,7 @@ def test_a_sweep_without_points_stays_empty(scene, sensor):
     assert result.sweep.columns["cause"].shape == (0,)
 
 
+@pytest.mark.extended
 def test_results_do_not_depend_on_how_pulses_are_divided(clear, sensor, monkeypatch):
     track = Track([0, 1], [[-10, 3, 0.7], [10, 3, 0.7]])
     effects = {

@@ -186,6 +186,7 @@ def test_organized_clouds(written, tmp_path):
     assert len(point_columns(data)["x"]) == len(more(rewriter.recording, 0).sweep)
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("plugin", "mode"),
     [

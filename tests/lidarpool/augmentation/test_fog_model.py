@@ -119,6 +119,7 @@ def soft_peak(extinction):
     return range_m[power.argmax()], power.max()
 
 
+@pytest.mark.extended(every=4)
 @pytest.mark.parametrize("visibility_km", VISIBILITIES_KM)
 def test_range_and_power_of_the_soft_peak(visibility_km, recording, sensor):
     result = augment(recording, sensor, visibility_km)

@@ -151,6 +151,7 @@ def test_a_killed_process_is_resumed(augmentation, drive, tmp_path, sweeps):
     assert content(out) == content(tmp_path / "expected")
 
 
+@pytest.mark.extended
 def test_a_partly_written_output_is_written_again(augmentation, tmp_path, monkeypatch):
     augmentation.run(tmp_path / "expected", workers=1)
     out = tmp_path / "wet"
@@ -174,6 +175,7 @@ def test_nothing_is_left_if_nothing_was_augmented(augmentation, drive, tmp_path)
     assert [*tmp_path.iterdir()] == [drive]
 
 
+@pytest.mark.extended
 def test_workers_without_the_work_folder_return_files(augmentation, tmp_path, monkeypatch):
     augmentation.run(tmp_path / "expected", workers=1)
     monkeypatch.setattr(WorkFolder, "is_accessible", lambda self: False)
@@ -192,6 +194,7 @@ def test_a_cluster_augments_sweeps(augmentation, tmp_path):
     assert content(tmp_path / "wet") == content(tmp_path / "expected")
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
     ("change", "noun"),
     [
@@ -229,6 +232,7 @@ def test_other_software_is_refused(augmentation, tmp_path, monkeypatch):
         augmentation.run(out, workers=1, resume=True)
 
 
+@pytest.mark.extended
 def test_damaged_manifests_are_reported(augmentation, tmp_path):
     out = tmp_path / "wet"
     with pytest.raises(KeyboardInterrupt):
@@ -250,6 +254,7 @@ def test_a_recording_that_changes_is_noticed(augmentation, drive, tmp_path):
     assert not (tmp_path / "wet").exists()
 
 
+@pytest.mark.extended
 def test_outputs_are_only_replaced_on_request(augmentation, tmp_path):
     out = tmp_path / "wet"
     augmentation.run(out, workers=1)
@@ -319,6 +324,7 @@ def test_a_single_file_keeps_its_name(points, tmp_path):
     assert into.outputs[0].read_bytes() == other.outputs[0].read_bytes()
 
 
+@pytest.mark.extended
 def test_recordings_are_resampled_and_augmented(augmentation, drive, tmp_path):
     vlp16 = load_sensor("velodyne/vlp16")
     clear = replace(augmentation, variants=Variants(Effects()), resampled=vlp16)
@@ -461,6 +467,7 @@ def test_campaigns_write_variants(augmentation, campaign, tmp_path):
     assert content(tmp_path / "three") == files
 
 
+@pytest.mark.extended
 def test_a_variant_does_not_depend_on_the_others(augmentation, campaign, tmp_path):
     variants = replace(augmentation, variants=CampaignVariants(campaign))
     variants.run(tmp_path / "all", workers=1)
@@ -469,6 +476,7 @@ def test_a_variant_does_not_depend_on_the_others(augmentation, campaign, tmp_pat
     assert content(tmp_path / "all" / "0001") == content(tmp_path / "alone")
 
 
+@pytest.mark.extended
 def test_interrupted_campaigns_continue(augmentation, campaign, tmp_path, monkeypatch):
     monkeypatch.setattr("lidarpool.augmentation.running.MAX_VARIANTS", 2)
     variants = replace(augmentation, variants=CampaignVariants(campaign))

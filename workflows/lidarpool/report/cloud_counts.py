@@ -136,35 +136,13 @@ class CloudCounts:
             return np.zeros((2, 3))
         return cell_positions(self._squares.box, self._precision_m, self._origin)
 
-    @property
-    def above(self) -> Ints:
-        """Number of points in each pixel of the top view, with the southernmost row first.
-
-        Shape (rows, columns).
-        """
-        return self._pixels.counts.T
-
-    @property
-    def pixel_m(self) -> float:
-        """Side length of a pixel in the top view `above`, in meters."""
-        return self._pixels.side * self._precision_m
-
-    @property
-    def corner(self) -> Floats:
-        """World position of the southwest corner of the top view `above`, in meters.
-
-        The array has shape (2,).
-        """
-        return cell_positions(self._pixels.lowest, self._precision_m, self._origin[:2])
-
-    @property
-    def _pixels(self) -> GridCounts:
-        """Grid for the top view `above`, with pixels large enough for about one point each."""
+    def top_view(self) -> Squares:
+        """Return the points in squares of the size of pixels, for about one point per pixel."""
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:
             pixels.coarsen()
-        return pixels
+        return self._squares_of(pixels)
 
     @property
     def density(self) -> Density | None:
@@ -186,6 +164,9 @@ class CloudCounts:
         grid = deepcopy(self._squares)
         while grid.side * self._precision_m < least_m:
             grid.coarsen()
+        return self._squares_of(grid)
+
+    def _squares_of(self, grid: GridCounts) -> Squares:
         corner = cell_positions(grid.lowest, self._precision_m, self._origin[:2])
         return Squares(grid.counts.T, corner, grid.side * self._precision_m)
 
@@ -254,8 +235,13 @@ class GridCounts:
             lowest = _numbers(self.box[0], self._level)
             finer = [low + np.arange(self._across) for low in lowest]
             counts = self._array[self._indices(finer)]
+            coarser = []
+            for axis, numbers in enumerate(finer):
+                halves, first = np.unique(numbers >> 1, return_index=True)
+                counts = np.add.reduceat(counts, first, axis)
+                coarser.append(halves)
             self._array = np.zeros_like(self._array)
-            np.add.at(self._array, self._indices([numbers >> 1 for numbers in finer]), counts)
+            self._array[self._indices(coarser)] = counts
         self._level += 1
 
     def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:

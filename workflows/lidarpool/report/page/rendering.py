@@ -26,7 +26,7 @@ from PIL import Image
 from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
-from lidarsim.numerics.arrays import Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise, Returns
@@ -34,6 +34,7 @@ from lidarsim.words import natural_sort_key, plural, remove_common_prefix, short
 from lidarview.render.stage import nice_step
 
 from ...clouds.format_table import data_set_title
+from ...plan.flight_density import Squares
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.pipeline.task_records import TaskRecord
 from ...run.run_result import RunResult
@@ -86,15 +87,16 @@ def write_page(
         If the file cannot be written.
     """
     has_model = any(mounted.sensor.name for mounted in result.survey.mounted_sensors)
-    marks = _station_marks(result, cloud)
+    top_view = cloud.top_view()
+    marks = _station_marks(result, top_view)
     text = render_template(
         "page.html",
         report=report,
         cloud=cloud,
         name="" if scenario is None or has_model else scenario.title,
-        pictures={"above": draw_top_view(cloud.above, cloud.pixel_m, marks)},
+        pictures={"above": draw_top_view(top_view.counts, top_view.side_m, marks)},
         marks=len(marks),
-        densities=_density_range(cloud),
+        densities=_density_range(top_view),
         changed=_changed_fields,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_scenario_yaml(scenario) if scenario else "",
@@ -123,15 +125,15 @@ def insert_picture(page: Path, name: str, svg: str) -> None:
 _Mark = tuple[float, float, int]
 
 
-def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
-    """Return markers for the stations of a stationary sensor that are within the cloud's bounds."""
+def _station_marks(result: RunResult, top_view: Squares) -> list[_Mark]:
+    """Return markers for the stations of a stationary sensor that are within the top view."""
     survey = result.survey
     if survey.coordinates != "world" or survey.path.moves or not len(result.points):
         return []
     indices = even_indices(survey.path.stations, MAX_MARKS)
     positions = np.array([survey.path.pose(int(k)).position for k in indices])
-    rows, columns = cloud.above.shape
-    pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.corner) / cloud.pixel_m
+    rows, columns = top_view.counts.shape
+    pixels = (positions[:, :2] + result.scene.origin[:2] - top_view.corner) / top_view.side_m
     is_within = ((pixels >= 0) & (pixels <= (columns, rows))).all(axis=1)
     return [
         (float(x), float(rows - y), int(index) + 1)
@@ -139,7 +141,7 @@ def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
     ]
 
 
-def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
+def draw_top_view(counts: Floats | Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
     """Draw point counts as a top view in SVG, with a scale bar.
 
     In dark mode, the page inverts the lightness of the points.
@@ -164,7 +166,7 @@ def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = (
     )
 
 
-def _shade_counts(counts: Ints) -> str:
+def _shade_counts(counts: Floats | Ints) -> str:
     """Return an image of point counts as a data URL.
 
     `counts` has shape (rows, columns).
@@ -202,15 +204,15 @@ def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> 
     )
 
 
-def _density_range(cloud: CloudCounts) -> tuple[float, float] | None:
+def _density_range(top_view: Squares) -> tuple[float, float] | None:
     """Return the minimum and maximum density in the top view, in points per square meter.
 
     Only pixels with points count. Return None if there are no points.
     """
-    counts = cloud.above[cloud.above > 0]
+    counts = top_view.counts[top_view.counts > 0]
     if not len(counts):
         return None
-    return float(counts.min()) / cloud.pixel_m**2, float(counts.max()) / cloud.pixel_m**2
+    return float(counts.min()) / top_view.side_m**2, float(counts.max()) / top_view.side_m**2
 
 
 def render_template(
