@@ -176,6 +176,30 @@ def test_rays_hit_an_object_where_it_is_at_their_time(rays, track):
     assert hits.object.tolist() == [0, 0, 0, -1]
 
 
+def test_uneven_ground_below_an_object_is_no_part_of_it(rays, track):
+    random = np.random.default_rng(7)
+    times_s = np.sort(random.uniform(0, 3, 6_000))
+    ends = random.uniform((-6, 5, 0.08), (2, 7, 0.15), (6_000, 3))
+    ground = MovingRays(
+        (times_s / PERIOD_S).astype(int),
+        times_s,
+        np.tile(SENSOR, (len(ends), 1)),
+        ends,
+        np.ones(len(ends), bool),
+        np.zeros(len(ends), bool),
+        np.zeros(len(ends), np.int64),
+        np.full(len(ends), np.nan),
+        np.zeros(len(ends), np.int64),
+        np.full(len(ends), -1),
+    )
+    both = MovingRays.concatenate([rays, ground])
+    both = both.select(np.argsort(both.sweep, kind="stable"))
+    assert track.contains(track.to_object(ground.ends, ground.time_s)).sum() > 1_000
+    (found,) = reconstruct_objects([track], both, 0.1, np.radians(0.5))
+    level = np.abs(found.surfels.normals[:, 2]) > 0.8
+    assert not level[found.surfels.centers[:, 2] < 0.2].any()
+
+
 def test_the_middle_of_a_long_vehicle_belongs_to_its_cluster():
     along, height = np.meshgrid(np.arange(0, 6, 0.1), np.arange(0.5, 2, 0.1))
     bus = np.column_stack([along.ravel(), np.full(along.size, 4.0), height.ravel()])

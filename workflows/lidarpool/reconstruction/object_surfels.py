@@ -24,6 +24,7 @@ _MAX_RAYS = 200_000  # evenly chosen rays that form an object
 _MAX_SHIFT_M = 0.15  # Rays with a larger range difference do not move a surfel.
 _PASSING_VOTES = 3  # votes of a ray that passes a surfel, relative to one that ends on it
 _ON_RAY_M = 0.1  # A ray passes a surfel if it ends this far behind it.
+_GROUND_M = 0.2  # maximum height of points on the ground above the underside of the box
 _REACH_M = 0.5  # margin around a box within which rays are cast
 
 
@@ -55,7 +56,7 @@ def _reconstruct(
 ) -> RecordedObject | None:
     near = rays.select(_near(track, rays))
     sweep = _in_object_frame(track, near)
-    inside = near.returned & track.contains(sweep.world)
+    inside = near.returned & track.contains(sweep.world) & ~_are_on_ground(sweep.world, near.moved)
     points = sweep.world[inside]
     outward = (sweep.origins - sweep.world)[inside]
     for share in _VOXEL_SHARES:
@@ -79,6 +80,11 @@ def _reconstruct(
         int(labels[counts.argmax()]),
         len(np.unique(near.sweep[inside])),
     )
+
+
+def _are_on_ground(points: Floats, moved: Bools) -> Bools:
+    """Mark low points in the object frame that did not move."""
+    return (points[:, 2] < _GROUND_M) & ~moved
 
 
 def _near(track: ObjectTrack, rays: MovingRays) -> Ints:
