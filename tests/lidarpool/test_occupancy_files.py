@@ -171,8 +171,11 @@ def test_existing_grids_are_kept_unless_they_are_to_be_overwritten(scenario, kit
     options = ["--layout", "semantickitti", "--workers", "1", "--following", "1"]
     before = {path.name: path.read_bytes() for path in kitti.iterdir()}
     outcome = invoke(scenario, out, *options)
-    assert "already exists. Use another folder with `--out`" in str(outcome.exception)
+    assert "already exists. Use another output with `--out`" in str(outcome.exception)
     assert invoke(scenario, out, *options, "--overwrite").exit_code == 0
+    outcome = invoke(scenario, out, "--layout", "occ3d", "--workers", "1")
+    assert "describes another grid. Use another folder" in str(outcome.exception)
+    assert not (out / "gts").exists()
     assert {path.name: path.read_bytes() for path in kitti.iterdir()} == before
 
 

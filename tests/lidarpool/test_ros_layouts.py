@@ -32,6 +32,7 @@ from lidarpool import (
 from lidarpool.cli.result_commands import export
 from lidarpool.clouds.format_table import LAYOUTS
 from lidarpool.clouds.ros import layouts
+from lidarpool.clouds.ros.bags import header_of
 from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
 from lidarpool.clouds.ros.organized import organized_rows
 from lidarpool.clouds.writing import ExportSpec
@@ -322,6 +323,28 @@ def test_fields_of_several_numbers_and_of_the_same_name():
         says = f"its field 'n' has datatype {datatype} and count {count}, but a PointField has"
         with pytest.raises(ValueError, match=says):
             point_columns(point_cloud(rows, [*axes, ("n", 12, datatype, count)]))
+
+
+@pytest.mark.parametrize(
+    ("width", "row_step", "says"),
+    [
+        (1_000_000, 24, "a row of 1,000,000 points of 12 bytes is stated, but a row has only 24"),
+        (2, 48, "its data have 24 bytes, but 1 rows of 48 bytes are stated"),
+    ],
+)
+def test_the_size_of_a_message_is_that_of_its_data(width, row_step, says):
+    rows = np.zeros((2, 3), np.float32).view([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])[:, 0]
+    data = point_cloud(rows, [(axis, 4 * k, 7, 1) for k, axis in enumerate("xyz")])
+    message = message_types().deserialize_cdr(data, POINT_CLOUD)
+    stated = replace(message, width=width, row_step=row_step)
+    with pytest.raises(ValueError, match=says):
+        point_columns(bytes(message_types().serialize_cdr(stated, POINT_CLOUD)))
+
+
+def test_stamps_before_1970_are_negative():
+    data = bytearray(point_cloud(np.zeros(1, [("x", "<f4")]), [("x", 0, 7, 1)]))
+    data[4:8] = (-5).to_bytes(4, "little", signed=True)
+    assert header_of(bytes(data)) == (-5_000_000_000, "lidar")
 
 
 @pytest.mark.extended

@@ -292,12 +292,18 @@ def test_the_command_selects_the_form_by_extension(room, tmp_path):
         cli, ["fit", "--pattern", str(table), "--out", model, "--pose", "0,0,1"]
     )
     assert "--pose cannot be combined with --pattern" in refused.output
+    with pytest.raises(LidarError, match=r"mine\.yaml already exists.*--overwrite"):
+        runner.invoke(cli, ["fit", "--pattern", str(table), "--out", model], catch_exceptions=False)
     sweeps = tmp_path / "sweeps"
     sweeps.mkdir()
     (sweeps / "1.ply").write_text("ply")
     for source, out, expected in (
         (table, "mine.xml", r"extension \.yaml.* for a sensor model, or \.npz"),
-        (sweeps, "mine.yaml", r"contains \.ply files, which are not read as the sweeps.*\.pcd"),
+        (
+            sweeps,
+            "of-sweeps.yaml",
+            r"contains \.ply files, which are not read as the sweeps.*\.pcd",
+        ),
     ):
         with pytest.raises(LidarError, match=expected):
             runner.invoke(

@@ -18,6 +18,7 @@ from lidarpool.reconstruction.object_clusters import find_clusters
 from lidarpool.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
 from lidarpool.reconstruction.object_tracks import ObjectTrack
 from lidarpool.recordings.opening import open_recording
+from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
@@ -250,6 +251,24 @@ def boxes():
     found = open_recording(the_cloud(), "front", name="cloud").boxes
     assert found is not None
     return found
+
+
+@pytest.mark.parametrize("side", [-4.5, np.nan, np.inf])
+def test_boxes_without_a_size_are_refused(side):
+    with pytest.raises(
+        ValueError, match=rf"size of box 7 \(Car\) must be positive.*{side:g} x"
+    ):
+        RecordedBoxes.from_rows([(0, 7, "Car", np.eye(4), (side, 1.8, 1.5))])
+
+
+def test_rotations_of_boxes_have_the_length_1():
+    half = np.sqrt(0.5)
+    turned = recorded_rotation((0, 0, 1.001 * half, half), "box 7")
+    np.testing.assert_allclose(turned, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=2e-3)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+    for scale in (0, 1.1, np.nan):
+        with pytest.raises(ValueError, match="the quaternion of box 7 has the length"):
+            recorded_rotation((0, 0, 0, scale), "box 7")
 
 
 def test_results_have_the_boxes_of_their_actors(boxes):

@@ -614,3 +614,12 @@ def test_what_does_not_fit_together(tmp_path, options, message):
         options = options | {"calibration": tmp_path / options["calibration"]}
     with pytest.raises(LidarError, match=message):
         load_sensor(**options)
+
+
+def test_rings_match_a_model_if_they_are_most_of_its_beams():
+    dense = read_model("hesai/pandar128")
+    beams = np.array(dense.beams.elevation_deg)
+    assert dense.matches_rings(beams) and dense.matches_rings(beams[:40])
+    assert not dense.matches_rings(beams[::8])
+    assert not dense.matches_rings(beams + 5)
+    assert dense.matches_rings(beams[:0])

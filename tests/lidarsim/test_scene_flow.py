@@ -218,6 +218,19 @@ def test_returns_without_a_surface_or_a_next_sweep_have_no_flow():
     assert (on_car & ~expected & (seconds < 0.25)).sum() > 5
 
 
+def test_the_longer_of_two_complete_sweeps_has_flow_to_its_end():
+    sensor = load_sensor("velodyne/vlp16")
+    firings = [len(sensor.firings_of_revolution(number)) for number in range(3)]
+    assert len({*firings}) == 2
+    steps = sensor.steps_of_revolution(2).stop
+    cloud = cloud_of(
+        Scene.from_meshes([block("Room", (40, 40, 12))]),
+        survey_of(sensor, steps, poses=[(0, 0, 0)]),
+    )
+    finite = [np.isfinite(points["flow_x"]).mean() for points in cloud.sweeps().points(cloud)]
+    assert finite == [1, 1, 0]
+
+
 def test_a_frozen_sensor_has_no_flow():
     scene = Scene.from_meshes([level("Ground", -2)])
     fault = Fault("frozen", from_s=0.15, to_s=0.25)

@@ -25,6 +25,9 @@ def folder(tmp_path, monkeypatch):
     [
         (("--overlap", "99%"), "'99%' is not a valid overlap. Expected a value from 0% to 95%"),
         (("--overlap", "0.99"), "'0.99' is not a valid overlap. Expected a value from 0% to 95%"),
+        (("--overlap", "1.5"), "'1.5' is not a valid overlap. Expected a value from 0% to 95%"),
+        (("--heading", "nan"), "'nan' is not a finite number"),
+        (("--agl", "inf"), "inf is not in the range"),
         (("--speed", "12-4"), "the lower limit must come first. Use `--speed 4-12`"),
         (("--speed", "0-4"), "'0-4' is not a valid speed. Expected a speed from 0.1 to 400"),
         pytest.param(

@@ -317,6 +317,29 @@ def test_damaged_files_are_named_once(drive, tmp_path):
     assert str(caught.value).count(str(path)) == 1
 
 
+def test_scaled_poses_are_refused(drive, tmp_path):
+    shutil.copytree(drive, tmp_path / "set")
+    poses = tmp_path / "set/sequences/00/poses.txt"
+    values = np.loadtxt(poses).reshape(-1, 3, 4)
+    values[1, :, :3] *= 1.5
+    np.savetxt(poses, values.reshape(-1, 12))
+    recording = open_recording(tmp_path / "set", "00")
+    assert recording[0].pose is not None
+    with pytest.raises(LidarError, match="the pose of sweep 1 is scaled, skewed or mirrored"):
+        recording[1]
+
+
+def test_broken_boxes_are_told_in_a_sentence(drive, tmp_path):
+    shutil.copytree(drive, tmp_path / "set")
+    for file in (tmp_path / "set").rglob("label_02/*.txt"):
+        file.write_text("1.5 0 Car 0 0 0 0 0 0 0 1 1 1 0 0 0 0\n")
+    rewriter = opened(tmp_path / "set", "00")
+    augment = partial(changed, boxes=two_boxes(), visibility=[0.5, 0.0])
+    with pytest.raises(LidarError, match=r"set cannot be read: invalid literal for int.*'1\.5'"):
+        rewrite(rewriter, tmp_path / "new", tmp_path / "work", augment)
+    assert not (tmp_path / "new").exists()
+
+
 def test_links_in_the_source(drive, tmp_path):
     source = tmp_path / "set"
     (source / "velodyne").mkdir(parents=True)

@@ -15,6 +15,7 @@ from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.mounting.search import listed_candidates
 from lidarpool.scenario.mount_sections import VehicleFile
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.road_users import ROAD_USERS
 from lidarsim.schema.vocabulary import BODIES, TARGETS
@@ -195,8 +196,27 @@ def test_the_ranking_is_written(folder):
         shares = " ".join(f"{100 * share:.1f} %" for share in one["detection"].values())
         assert f"{one['name']} {shares}" in cells
 
+    Path("car-mounts/mount.json").unlink()
     again = mount("car.yaml")
     assert isinstance(again.exception, LidarError) and "already exists" in str(again.exception)
+
+
+def test_any_names_make_a_scenario(folder):
+    target = {"box": [1, 1, 1], "reflectance": 0.3}
+    mounts = {"top\nroof": [0, 0.5, 1.6]}
+    Path("car.yaml").write_text(
+        yaml.safe_dump(
+            SMALL
+            | {"targets": {"*": target, "a[b]": target | {"reflectance": 0.6}}, "combine": "all"}
+            | {"sensors": {"left": {"model": "rings.yaml", "mounts": mounts}}}
+        )
+    )
+    outcome = mount("car.yaml", "--workers", "1")
+    assert outcome.exit_code == 0, outcome.output
+    best = Scenario.load("car-mounts/best.yaml")
+    survey = prepare(best).survey
+    found = {material.objects: material.reflectance for material in survey.materials}
+    assert found == {("[*]",): 0.3, ("a[[]b]",): 0.6, ("*",): 0.1}
 
 
 def test_built_in_names_are_listed_once():

@@ -126,32 +126,32 @@ class _Placement(NamedTuple):
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
 @click.option(
     "--reflectance",
-    type=click.FloatRange(0, 1, min_open=True),
+    type=options.Number(0, 1, min_open=True),
     metavar="SHARE",
     help="Reflectance of all recorded surfaces, for a recording without intensities.",
 )
-@click.option("--rain", type=click.FloatRange(0, 300), metavar="MM_H", help="Rain rate in mm/h.")
+@click.option("--rain", type=options.Number(0, 300), metavar="MM_H", help="Rain rate in mm/h.")
 @click.option(
     "--snow",
-    type=click.FloatRange(0, 50),
+    type=options.Number(0, 50),
     metavar="MM_H",
     help="Snowfall rate in mm/h (water equivalent).",
 )
 @click.option(
     "--fog",
-    type=click.FloatRange(0.001, 1e6),
+    type=options.Number(0.001, 1e6),
     metavar="KM",
     help="Visibility in fog or haze in kilometers.",
 )
 @click.option(
     "--dust",
-    type=click.FloatRange(0, 1e5),
+    type=options.Number(0, 1e5),
     metavar="MG_M3",
     help="Concentration of mineral dust in mg/m³.",
 )
 @click.option(
     "--dirt",
-    type=click.FloatRange(0, 1),
+    type=options.Number(0, 1),
     metavar="SHARE",
     help="Share of the energy that dirt on the window transmits, out and back combined.",
 )
@@ -163,19 +163,19 @@ class _Placement(NamedTuple):
 )
 @click.option(
     "--dropped-packets",
-    type=click.FloatRange(0, 1),
+    type=options.Number(0, 1),
     metavar="SHARE",
     help=f"Share of packets that are lost. A packet contains {_PACKET_FIRINGS} firings.",
 )
 @click.option(
     "--dropout",
-    type=click.FloatRange(0, 1),
+    type=options.Number(0, 1),
     metavar="SHARE",
     help="Share of returns that are lost at random.",
 )
 @click.option(
     "--range-noise",
-    type=click.FloatRange(0, 1000),
+    type=options.Number(0, 1000),
     metavar="M",
     help="Standard deviation of the noise added to ranges, in meters.",
 )
@@ -202,7 +202,7 @@ class _Placement(NamedTuple):
 )
 @click.option(
     "--heading",
-    type=float,
+    type=options.Number(),
     metavar="DEG",
     multiple=True,
     help="Heading of the inserted object in degrees, counterclockwise from the x axis of the "

@@ -6,6 +6,7 @@ respond immediately.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, fields, replace
@@ -78,7 +79,7 @@ _common_options = shared.combine(
     ),
     click.option(
         "--pace",
-        type=click.FloatRange(0, min_open=True),
+        type=shared.Number(0, min_open=True),
         metavar="SPEED",
         help="With --live, show frames in order at this multiple of the scan rate (default: show "
         "each frame as soon as it is simulated). Not for campaigns.",
@@ -103,12 +104,14 @@ def _parse_duration(text: str) -> float:
     """Convert a duration such as 90, 90s, 10m or 2h to seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
-        return float(text[:-1]) * unit if unit else float(text)
-    except ValueError as error:
-        message = (
+        seconds = float(text[:-1]) * unit if unit else float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise click.BadParameter(
             f"{text!r} is not a duration. Expected a number with the unit s, m or h, such as 90s."
         )
-        raise click.BadParameter(message) from error
+    return seconds
 
 
 def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:

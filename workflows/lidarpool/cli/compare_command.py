@@ -70,13 +70,13 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
 @options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
 @click.option(
     "--azimuth-deg",
-    type=float,
+    type=options.Number(),
     help="Cell width of the range images in degrees (default: the azimuth step of the sensor).",
 )
 @click.option(
     "--distance",
     "distances_m",
-    type=float,
+    type=options.Number(),
     metavar="M",
     multiple=True,
     default=(0.05, 0.1, 0.2, 0.5),
@@ -109,7 +109,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
 @click.option(
     "--radius",
     "radius_m",
-    type=float,
+    type=options.Number(),
     metavar="M",
     help="Radius of the planes and cylinders in meters (default: from the point density of B). "
     "With --survey planes or m3c2.",
@@ -117,14 +117,14 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
 @click.option(
     "--max-distance",
     "max_distance_m",
-    type=float,
+    type=options.Number(),
     metavar="M",
     help="Maximum distance from B in meters (default: 1). With --survey planes, m3c2 or mesh.",
 )
 @click.option(
     "--cell",
     "cell_m",
-    type=float,
+    type=options.Number(),
     metavar="M",
     default=1.0,
     show_default=True,
@@ -133,7 +133,7 @@ _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
 @click.option(
     "--max-roughness",
     "max_roughness_m",
-    type=float,
+    type=options.Number(),
     metavar="M",
     default=0.1,
     show_default=True,

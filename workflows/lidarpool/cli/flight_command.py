@@ -40,6 +40,7 @@ _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degre
 # Level ground extends beyond the trajectory by this multiple of half the swath.
 _GROUND_MARGIN = 1.5
 _MIN_MARGIN_M = 50
+_MIN_PERCENTAGE = 5  # Larger overlaps without a percent sign are percentages.
 _NEGATIVE_BOUNDS = re.compile(r"-[\d.]+,")
 _ORIGIN_M = 100.0  # the origin of a plan in a UTM zone is a multiple of this length
 
@@ -50,7 +51,7 @@ def _parse_overlap(text: str) -> float:
         fraction = float(text.removesuffix("%"))
     except ValueError:
         fraction = math.nan
-    if text.endswith("%") or fraction >= 1:
+    if text.endswith("%") or fraction >= _MIN_PERCENTAGE:
         fraction /= 100
     if not (0 <= fraction <= 0.95):
         raise click.BadParameter(
@@ -109,7 +110,7 @@ class _FlightCommand(click.Command):
 @click.option(
     "--agl",
     "agl_m",
-    type=click.FloatRange(0, 20_000, min_open=True),
+    type=options.Number(0, 20_000, min_open=True),
     required=True,
     metavar="M",
     help="Height of the aircraft above the mean ground below each line, in meters.",
@@ -124,7 +125,7 @@ class _FlightCommand(click.Command):
 @click.option(
     "--density",
     "density_m2",
-    type=click.FloatRange(0, 1e5, min_open=True),
+    type=options.Number(0, 1e5, min_open=True),
     metavar="N",
     help="Number of points per square meter in each strip (default: the density at the maximum "
     "speed and pulse rate).",
@@ -140,7 +141,7 @@ class _FlightCommand(click.Command):
 @click.option(
     "--fov",
     "fov_deg",
-    type=click.FloatRange(1, 170),
+    type=options.Number(1, 170),
     metavar="DEG",
     help="Planned field of view across the track in degrees (default: that of the sensor, at most "
     "90).",
@@ -148,7 +149,7 @@ class _FlightCommand(click.Command):
 @click.option(
     "--heading",
     "heading_deg",
-    type=click.FloatRange(-360, 360),
+    type=options.Number(-360, 360),
     metavar="DEG",
     help="Direction of the lines in degrees clockwise from north (default: along the longest "
     "side of the area).",

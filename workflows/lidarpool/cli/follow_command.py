@@ -67,7 +67,7 @@ from .first_step import print_first_step
 @click.option(
     "--vanish-after",
     "vanish_after_s",
-    type=click.FloatRange(0, 1e6),
+    type=options.Number(0, 1e6),
     default=1.0,
     show_default=True,
     metavar="SECONDS",

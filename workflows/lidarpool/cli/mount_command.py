@@ -64,7 +64,13 @@ def mount(
     print_first_step("reading the vehicle", quiet=as_json)
     from ..clouds.folder import check_not_existing, result_folder
     from ..mounting.study import MountStudy, figures_of
-    from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, write_study
+    from ..mounting.study_files import (
+        FIGURES_FILE,
+        PAGE_FILE,
+        SCENARIO_FILE,
+        study_files,
+        write_study,
+    )
     from ..processes.fork_server import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from ..scenario.mount_sections import VehicleFile
@@ -75,7 +81,7 @@ def mount(
     study = MountStudy.from_file(VehicleFile.load(vehicle))
     folder = Path(f"{vehicle.stem}-mounts") if out is None else out
     with result_folder(folder):
-        check_not_existing([folder / FIGURES_FILE], overwrite=overwrite)
+        check_not_existing((folder / name for name in study_files(study)), overwrite=overwrite)
         client = nullcontext() if scheduler is None else connect_client(scheduler, files)
         with client as connected, terminal.status("simulating the sensors at all mounts"):
             result = study.run(client=connected, workers=workers)
@@ -121,8 +127,11 @@ def _class_lines(result: MountRanking) -> Iterator[str]:
     """Format how well the best candidate detects each class as lines of text."""
     best = result.best
     targets = [t for t in result.study.placements.targets if best.detection[t.name] >= 0]
-    width = max(5, *(len(target.name) for target in targets))
-    yield f"{'class':<{width}}   detected   by two sensors   mean points   ({best.candidate.name})"
+    width = max(5, *(len(printable(target.name)) for target in targets))
+    yield (
+        f"{'class':<{width}}   detected   by two sensors   mean points   "
+        f"({printable(best.candidate.name)})"
+    )
     for target in targets:
         name = target.name
         yield (

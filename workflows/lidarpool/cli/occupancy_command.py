@@ -60,7 +60,7 @@ def _parse_extent(text: str) -> Corners:
 @click.option(
     "--voxel-size",
     "voxel_m",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Number(0, min_open=True),
     metavar="M",
     help="Edge length of a voxel in meters (default: that of the layout).",
 )

@@ -45,7 +45,7 @@ _NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, 
 )
 @click.option(
     "--rate",
-    type=click.FloatRange(0.001, 1000),
+    type=options.Number(0.001, 1000),
     default=1.0,
     show_default=True,
     help="Playback rate; 0.5 is half speed.",
@@ -67,7 +67,7 @@ _NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, 
 )
 @click.option(
     "--pose-rate-hz",
-    type=click.FloatRange(0, 10_000, min_open=True),
+    type=options.Number(0, 10_000, min_open=True),
     metavar="RATE",
     help="For ros2, poses per second on /tf (default: one per sweep).",
 )

@@ -137,7 +137,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 )
 @click.option(
     "--pose-rate-hz",
-    type=click.FloatRange(0, 10_000, min_open=True),
+    type=options.Number(0, 10_000, min_open=True),
     metavar="RATE",
     help="Poses per second on /tf in mcap and rosbag2 (default: one per sweep).",
 )
@@ -148,7 +148,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 )
 @click.option(
     "--intensity-full-scale",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Number(0, min_open=True),
     metavar="INTENSITY",
     help="Intensity that is stored as 65,535 in las and laz (default: a value that at most 1 % of "
     "the points reach).",
@@ -367,15 +367,17 @@ def view(
 @click.option(
     "--white-intensity",
     "white",
-    type=float,
+    type=options.Number(),
     help="Intensity of a white surface, if intensities do not depend on the range.",
 )
+@options.overwrite
 @options.as_json
 def fit(
     recording: Path,
     out: Path,
     pattern: bool,
     pose: Sequence[Sequence[float]],
+    overwrite: bool,
     as_json: bool,
     **settings: Any,
 ) -> None:
@@ -394,24 +396,33 @@ def fit(
       lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
       lidarpool fit --pattern recording.pcd --out mine.yaml
     """  # noqa: D301 - Click requires the character \b
+    from ..clouds.folder import check_not_existing
     from ..comparing.fit import fit as fitted
     from ..processes.fork_server import keep_freed_memory
 
     keep_freed_memory()
     if pattern:
-        _fit_pattern(recording, out, as_json, pose=pose, **settings)
+        _fit_pattern(recording, out, as_json, overwrite=overwrite, pose=pose, **settings)
         return
+    check_not_existing([out, out.with_suffix(".html")], overwrite=overwrite)
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)
     lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
     options.print_results(fitted_sensor.figures, lines, as_json)
 
 
 def _fit_pattern(
-    recording: Path, out: Path, as_json: bool, *, sensor: str | None = None, **settings: Any
+    recording: Path,
+    out: Path,
+    as_json: bool,
+    *,
+    overwrite: bool,
+    sensor: str | None = None,
+    **settings: Any,
 ) -> None:
     """Estimate a scan pattern. The extension of the output file selects its form."""
     from lidarsim.sensor.models import MODEL_FILES
 
+    from ..clouds.folder import check_not_existing
     from ..scan_patterns.fitting import check_pattern_file, fit_pattern
 
     unused = [name for name, value in settings.items() if value]
@@ -419,6 +430,7 @@ def _fit_pattern(
         option = {"white": "white-intensity"}.get(unused[0], unused[0])
         raise click.UsageError(f"--{option} cannot be combined with --pattern.")
     check_pattern_file(out)
+    check_not_existing([out], overwrite=overwrite)
     as_rays = out.suffix.lower() not in MODEL_FILES
     fitted = fit_pattern(recording, as_rays=as_rays, sensor=sensor)
     lines = [repr(fitted), *map(click.format_filename, fitted.save(out))]

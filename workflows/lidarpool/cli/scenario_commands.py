@@ -390,7 +390,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 @scene.command()
 @click.option(
     "--voxel-m",
-    type=float,
+    type=options.Number(),
     help="Voxel size in meters; one point is kept per voxel (default: the point spacing).",
 )
 @click.option(
@@ -507,7 +507,7 @@ def _write_scene(
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, 1e6, min_open=True),
+    type=options.Number(0, 1e6, min_open=True),
     metavar="S",
     help="Duration of the pattern (default: one revolution or frame).",
 )
@@ -527,15 +527,23 @@ def _write_scene(
 @click.option(
     "--rate",
     "rate_hz",
-    type=float,
+    type=options.Number(),
     metavar="HZ",
     help="Revolutions per second, as rate_hz in a scenario.",
 )
 @click.option(
-    "--min-range", "min_range_m", type=float, metavar="M", help="Minimum range in meters."
+    "--min-range",
+    "min_range_m",
+    type=options.Number(),
+    metavar="M",
+    help="Minimum range in meters.",
 )
 @click.option(
-    "--max-range", "max_range_m", type=float, metavar="M", help="Maximum range in meters."
+    "--max-range",
+    "max_range_m",
+    type=options.Number(),
+    metavar="M",
+    help="Maximum range in meters.",
 )
 @options.overwrite
 def sensors(

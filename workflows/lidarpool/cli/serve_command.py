@@ -36,7 +36,7 @@ def _require_grpc() -> None:
 )
 @click.option(
     "--rate-hz",
-    type=click.FloatRange(0, 1000, min_open=True),
+    type=options.Number(0, 1000, min_open=True),
     metavar="RATE",
     help="Sweeps per second of the sensors (default: from the models).",
 )

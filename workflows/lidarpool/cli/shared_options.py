@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial, reduce, wraps
@@ -39,6 +40,17 @@ class StoragePath(click.Path):
         from lidarsim.io.storage import Storage, is_url  # imported late to keep --help fast
 
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
+
+
+class Number(click.FloatRange):
+    """Parameter type for a finite number, which can be limited to a range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert text to a number, and refuse NaN and infinity."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
 
 
 flag = partial(click.option, is_flag=True)

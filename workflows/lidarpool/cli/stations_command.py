@@ -100,7 +100,7 @@ def _parse_percentage(text: str) -> float:
 @click.option(
     "--height",
     "height_m",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Number(0, min_open=True),
     default=1.7,
     metavar="M",
     help="Height of the instrument above the floor in meters.",
@@ -108,14 +108,14 @@ def _parse_percentage(text: str) -> float:
 @click.option(
     "--spacing",
     "spacing_m",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Number(0, min_open=True),
     metavar="M",
     help="Spacing of the candidate positions in meters (default: about 600 candidates).",
 )
 @click.option(
     "--slant",
     "slant_deg",
-    type=click.FloatRange(0, 90, min_open=True),
+    type=options.Number(0, 90, min_open=True),
     default=80.0,
     metavar="DEG",
     help="Maximum angle of incidence in degrees.",

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--voxel-m",
-    type=float,
+    type=options.Number(),
     default=0.1,
     show_default=True,
     help="Spacing of the surfels in meters.",

@@ -34,7 +34,7 @@ def check_not_existing(files: Iterable[Path], *, overwrite: bool) -> None:
     existing = next((file for file in files if file.exists()), None)
     if existing is not None and not overwrite:
         raise LidarError(
-            f"{existing} already exists. Use another folder with `--out`, or pass `--overwrite`."
+            f"{existing} already exists. Use another output with `--out`, or pass `--overwrite`."
         )
 
 

@@ -24,7 +24,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.io.named_files import check_name, file_below
 from lidarsim.io.storage import Storage
-from lidarsim.motion.rotations import matrices
+from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
@@ -745,4 +745,5 @@ class NuScenesTables:
 def _pose_of(row: _Row) -> Floats:
     """Return the pose matrix for a row with a rotation and a translation."""
     w, x, y, z = row["rotation"]
-    return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))
+    rotation = recorded_rotation((x, y, z, w), f"the row with the token {row['token']}")
+    return affine(rotation, np.array(row["translation"]))

@@ -26,8 +26,20 @@ class RecordedBoxes(NamedTuple):
     def from_rows(
         cls, rows: Iterable[tuple[int, int, str, Floats, Sequence[float]]]
     ) -> RecordedBoxes:
-        """Create boxes from rows with the values of the attributes."""
+        """Create boxes from rows with the values of the attributes.
+
+        Raises
+        ------
+        ValueError
+            If a size is negative or not finite.
+        """
         listed = list(rows)
+        for _, box, kind, _, size in listed:
+            if not all(0 <= side < np.inf for side in size):
+                raise ValueError(
+                    f"the size of box {box} ({kind or 'without a type'}) must be positive, but is "
+                    f"{' x '.join(f'{side:g}' for side in size)} m"
+                )
         sweep, number, kinds, poses, sizes = zip(*listed, strict=True) if listed else ((),) * 5
         return cls(
             np.array(sweep, np.int64),

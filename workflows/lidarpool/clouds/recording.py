@@ -39,7 +39,23 @@ from .rings import Rings
 
 METERS: Meters = (1.0, 1.0, 1.0)
 _MAX_POSE_ERROR_M = 10.0  # maximum error of a measured trajectory for which rays can be paired
+_MAX_ROTATION_ERROR = 0.01  # maximum deviation of the dot products of the axes of a pose
 _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
+
+
+def _check_rotations(poses: Floats, numbers: Sequence[int]) -> None:
+    """Raise ValueError unless the poses (n, 4, 4) of some sweeps consist of rotations and shifts.
+
+    Unknown poses, which contain NaN, are accepted.
+    """
+    rotations = poses[:, :3, :3]
+    errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero((errors > _MAX_ROTATION_ERROR) | (np.linalg.det(rotations) < 0))
+    if len(wrong):
+        raise ValueError(
+            f"the pose of sweep {numbers[wrong[0]]} is scaled, skewed or mirrored, but a pose "
+            "consists of a rotation and a translation"
+        )
 
 
 class SeveralSensorsError(LidarError):
@@ -265,6 +281,8 @@ class Recording:
         if self.meters != METERS:
             points = np.asarray(points, np.float64) * self.meters
         pose = sweep._pose
+        if pose is not None and not callable(pose):
+            _check_rotations(np.asarray(pose)[None], [number or 0])
         if self.meters != METERS and sweep.pose is not None:
             pose = sweep.pose.copy()
             pose[:3, 3] *= self.meters

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,14 @@ from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.declared import declared_values
+from lidarsim.words import printable
 
 from ..clouds.folder import staging
 from ..report.page.rendering import render_template
 from ..scenario.mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .pictures import draw_all
-from .study import MountRanking, figures_of, pose_entry
+from .study import MountRanking, MountStudy, figures_of, pose_entry
 
 SCENARIO_FILE = "best.yaml"
 PAGE_FILE = "report.html"
@@ -34,6 +36,16 @@ TARGETS_FOLDER = "targets"
 SHOWN_CANDIDATES = 50  # rows of the table in the report
 _SHOWN_DISTANCE_M = 10.0  # distance of the targets in the scenario
 _SHOWN_TARGETS = 12
+
+
+def study_files(study: MountStudy) -> list[str]:
+    """Return the names of the files that `write_study` writes for a study."""
+    return [SCENARIO_FILE, FIGURES_FILE, PAGE_FILE, VEHICLE_FILE, *_target_files(study)]
+
+
+def _target_files(study: MountStudy) -> list[str]:
+    count = min(len(study.placements.meshes), _SHOWN_TARGETS)
+    return [f"{TARGETS_FOLDER}/{number:02}.glb" for number in range(count)]
 
 
 def write_study(result: MountRanking, folder: Path) -> list[Path]:
@@ -50,9 +62,8 @@ def write_study(result: MountRanking, folder: Path) -> list[Path]:
     ):
         (staged / TARGETS_FOLDER).mkdir()
         meshes = {VEHICLE_FILE: result.study.evaluator.body}
-        shown = result.study.placements.meshes[:_SHOWN_TARGETS]
-        files = [f"{TARGETS_FOLDER}/{number:02}.glb" for number in range(len(shown))]
-        meshes |= dict(zip(files, shown, strict=True))
+        files = _target_files(result.study)
+        meshes |= dict(zip(files, result.study.placements.meshes, strict=False))
         for name, mesh in meshes.items():
             write_scene(staged / name, Scene.from_meshes([mesh]))
         figures = figures_of(result)
@@ -102,7 +113,8 @@ def _scenario(result: MountRanking, folder: Path, target_files: Sequence[str]) -
         "cloud": {"columns": ["range"]},
     }
     head = (
-        f"# {result.best.candidate.name}, the best candidate of {vehicle.source}. The vehicle is "
+        f"# {printable(result.best.candidate.name)}, the best candidate of "
+        f"{printable(str(vehicle.source))}. The vehicle is "
         "the object\n# vehicle, whose origin is on the ground. Each sensor scans one revolution.\n"
     )
     if near:
@@ -128,7 +140,7 @@ def _target_materials(result: MountRanking, count: int) -> list[dict[str, Any]]:
     """Return materials with the reflectances of the first meshes."""
     placements = result.study.placements
     return [
-        {"objects": mesh.name, "reflectance": placements.targets[target].reflectance}
+        {"objects": escape(mesh.name), "reflectance": placements.targets[target].reflectance}
         for mesh, target in zip(
             placements.meshes[:count], placements.mesh_target[:count].tolist(), strict=True
         )

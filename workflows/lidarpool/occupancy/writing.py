@@ -229,6 +229,9 @@ def write_occupancy(
             _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
             for first in range(0, layout.count, _TASK_SWEEPS)
         ]
+    info = _info(settings)
+    if not overwrite:
+        _check_same_grid(out / INFO_FILE, info)
     total = sum(len(task.sweeps) for task in tasks)
     done = 0
     file_count = 0
@@ -242,7 +245,7 @@ def write_occupancy(
             file_count += len(files)
             done += len(task.sweeps)
             progress(done, total)
-        _write(out / INFO_FILE, _info(settings))
+        _write(out / INFO_FILE, info)
     return WrittenOccupancy(len(numbers), total, file_count, tuple(notes))
 
 
@@ -268,6 +271,16 @@ def _write(path: Path, content: bytes) -> None:
     temporary = path.with_name(f"{TEMPORARY}{path.name}")
     temporary.write_bytes(content)
     temporary.replace(path)
+
+
+def _check_same_grid(file: Path, info: bytes) -> None:
+    """Raise LidarError if a file exists that does not contain the description `info` of a grid."""
+    with explain_os_errors(f"{file} cannot be read"):
+        if file.exists() and file.read_bytes() != info:
+            raise LidarError(
+                f"{file} already exists and describes another grid. Use another folder with "
+                "`--out`, or pass `--overwrite`."
+            )
 
 
 def _info(settings: OccupancySettings) -> bytes:

@@ -521,6 +521,11 @@ class _Building:
             response,
             sensor,
         )
+        elevation_deg = np.degrees(self.recorded.elevation_rad)
+        if self.base is not None and not self.base.matches_rings(elevation_deg):
+            fitted.notes.append(
+                f"the recorded rings do not match the rings of {self.base.name}. Check `--model`"
+            )
         if self.base is None and timing.rotation is None:
             fitted.notes.append(
                 "the direction of rotation of the sensor is unknown, so sensor.yaml assumes a "

@@ -80,7 +80,7 @@ def _labeled(
         rows = rows[np.unique(boxes.sweep[rows], return_index=True)[1]]
         sweeps = boxes.sweep[rows]
         world = alignment.poses[sweeps] @ boxes.poses[rows]
-        size = np.median(boxes.sizes[rows], axis=0)
+        size = np.maximum(np.median(boxes.sizes[rows], axis=0), _MIN_SIZE_M)
         positions = world[:, :3, 3] - world[:, :3, 2] * size[2] / 2
         yaw = np.unwrap(np.arctan2(world[:, 1, 0], world[:, 0, 0]))
         kind = boxes.kinds[int(rows[0])]

@@ -159,7 +159,9 @@ def _single_sweep(recording: Recording) -> Recording:
     columns: dict[str, np.ndarray] = {
         name: np.concatenate([np.asarray(part.columns[name]) for part in parts]) for name in names
     }
-    points = np.concatenate([np.asarray(part.points, np.float64) for part in parts])
+    points = np.concatenate(
+        [np.empty((0, 3)), *(np.asarray(part.points, np.float64) for part in parts)]
+    )
     sweep = Sweep(points, _with_seconds(columns))
     return Recording(recording.name, 1, lambda _: sweep, notes=recording.notes)
 

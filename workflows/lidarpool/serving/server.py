@@ -89,7 +89,10 @@ class SensorServer:
         try:
             port = self._server.add_insecure_port(str(address))
         except RuntimeError as error:
-            raise LidarError(f"The server cannot listen on {address}.") from error
+            raise LidarError(
+                f"The server cannot listen on {address}, because another program may use this "
+                "port. Pass another port with `--listen`."
+            ) from error
         self.address = address._replace(port=port)
 
     def __enter__(self) -> Self:

@@ -181,6 +181,16 @@ def point_rows(message: Any) -> Records:
             "itemsize": message.point_step,
         }
     )
+    if message.data.size != message.height * message.row_step:
+        raise ValueError(
+            f"its data have {message.data.size:,} bytes, but {message.height:,} rows of "
+            f"{message.row_step:,} bytes are stated"
+        )
+    if message.width * message.point_step > message.row_step:
+        raise ValueError(
+            f"a row of {message.width:,} points of {message.point_step:,} bytes is stated, but a "
+            f"row has only {message.row_step:,} bytes"
+        )
     lines = message.data.reshape(message.height, message.row_step)
     used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
     return used.reshape(-1).view(row)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..errors import LidarError
 from ..numerics.arrays import Floats
 from ..numerics.elementary import arctan2, sin_cos
 from ..numerics.vectors import cross, determinant, dot, matmul_of_components, norm
+
+_MAX_LENGTH_ERROR = 0.01  # maximum error of the length of a recorded quaternion
 
 # Number of power iterations, which is sufficient for matrices with rounding errors up to 2e-3.
 _ROUNDS = 8
@@ -113,6 +117,26 @@ def rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple
     sine = np.sqrt((x * x + y * y) + z * z)
     rates = 2 * arctan2(sine, np.abs(cosine)) / durations_s
     return axis / np.where(sine > 0, sine, 1), rates
+
+
+def recorded_rotation(quaternion: Sequence[float], owner: str) -> Floats:
+    """Convert a recorded quaternion (x, y, z, w) to a rotation matrix.
+
+    The quaternion is normalized, because it may be rounded. `owner` names its source in messages.
+
+    Raises
+    ------
+    ValueError
+        If the quaternion does not have the length 1.
+    """
+    values = np.asarray(quaternion, np.float64)
+    length = float(np.sqrt((values * values).sum()))
+    if not abs(length - 1) < _MAX_LENGTH_ERROR:
+        raise ValueError(
+            f"the quaternion of {owner} has the length {length:.3g}, but a rotation requires 1"
+        )
+    (rotation,) = matrices(values[None] / length)
+    return np.asarray(rotation)
 
 
 def matrices(quaternions: Floats) -> Floats:

@@ -42,6 +42,8 @@ class _ModelSection(BaseModel):
 
 
 _MAX_BEAMS = 1_000_000
+_MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams is not one of them
+_MAX_BEAMS_PER_RING = 4  # more beams than this per recorded ring belong to another sensor
 
 
 def _expand_numbers(value: Any) -> Any:
@@ -340,6 +342,19 @@ class SensorModel(_ModelSection):
     def needs_calibration(self) -> bool:
         """Whether the model requires a calibration file because it does not define its own rays."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
+
+    def matches_rings(self, elevation_deg: Floats) -> bool:
+        """Return whether recorded rings with the given elevations can be those of the model.
+
+        The elevations in degrees have shape (n,). Some beams may have no ring, because they
+        returned nothing, but not most of them.
+        """
+        if not len(elevation_deg) or self.needs_calibration:
+            return True
+        beams_deg = np.array(self.beams.elevation_deg or [np.inf])
+        offset_deg = np.abs(elevation_deg[:, None] - beams_deg).min(axis=1)
+        is_near = bool(offset_deg.max() <= _MAX_RING_OFFSET_DEG)
+        return is_near and len(beams_deg) <= _MAX_BEAMS_PER_RING * len(elevation_deg)
 
     def datasheet(self) -> Datasheet:
         """Return the noise and the settings of returns that the data sheet specifies.

@@ -15,7 +15,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.archives import pack_arrays
 from lidarsim.io.input_files import read_input
 from lidarsim.io.named_files import check_name
-from lidarsim.motion.rotations import matrices, quaternions_of
+from lidarsim.motion.rotations import matrices, quaternions_of, recorded_rotation
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES
 from lidarsim.words import join_names, plural
@@ -441,7 +441,7 @@ def _speed(boxes: Sequence[_KeyFrameBox]) -> float | None:
 def _inside(points: Floats, box: _Row) -> Ints:
     """Return a mask of the points in an annotated box, including its surface."""
     w, x, y, z = box["rotation"]
-    (rotation,) = matrices(np.array([[x, y, z, w]], np.float64))
+    rotation = recorded_rotation((x, y, z, w), f"the annotation {box['token']}")
     width, length, height = box["size"]
     local = (points - np.array(box["translation"])) @ rotation
     return np.asarray((np.abs(local) <= np.array([length, width, height]) / 2).all(axis=1))

@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
+from lidarsim.environment.extras import reading
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.words import list_names, plural
 
@@ -144,10 +145,8 @@ class Rewriter(ABC):
         LidarError
             If the sweep cannot be read, or if the format cannot store its points.
         """
-        try:
+        with reading(self.recording.name):
             files, details = self.encode(number, augmented)
-        except (OSError, ValueError) as error:
-            raise LidarError(unreadable_message(self.recording.name, error)) from error
         details |= {"number": number, "files": sorted(files), "points": len(augmented.sweep)}
         return files | {details_name(number): json.dumps(details).encode()}
 
@@ -232,7 +231,8 @@ class Rewriter(ABC):
         with new_target(target) as staged:
             base = self.path
             for rewriter, sweeps in parts:
-                notes += rewriter.assemble(staged, sweeps, base)
+                with reading(self.source.name):
+                    notes += rewriter.assemble(staged, sweeps, base)
                 base = staged
         return list(dict.fromkeys(notes))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -29,7 +30,7 @@ from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.bag_trajectories import read_bag
-from lidarsim.motion.rotations import matrices
+from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
 from lidarsim.scene.transform import affine
@@ -388,7 +389,9 @@ def _boxes(
             if not is_box or differences_ns[sweep] > _SAME_NS:
                 continue
             place, turn = marker.pose.position, marker.pose.orientation
-            (rotation,) = matrices(np.array([[turn.x, turn.y, turn.z, turn.w]]))
+            rotation = recorded_rotation(
+                (turn.x, turn.y, turn.z, turn.w), f"box {marker.id} on {_BOX_TOPIC}"
+            )
             world = affine(rotation, np.array([place.x, place.y, place.z]))
             pose = np.linalg.inv(poses[sweep]) @ world
             size = marker.scale.x, marker.scale.y, marker.scale.z
@@ -418,8 +421,8 @@ class MessageHeader(NamedTuple):
 
 def header_of(data: bytes) -> MessageHeader:
     """Decode the header with which a serialized ROS 2 message starts."""
-    order = "<u4" if data[1] & 1 else ">u4"
-    seconds, nanoseconds, length = np.frombuffer(data, order, 3, 4).tolist()
+    order = "<" if data[1] & 1 else ">"
+    seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
     frame = bytes(data[16 : 15 + length]).decode(errors="replace")
     return MessageHeader(seconds * 10**9 + nanoseconds, frame)
 

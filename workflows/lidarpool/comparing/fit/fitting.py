@@ -37,7 +37,6 @@ from .stack import SweepStack, check_sweeps
 from .standstill import moving_message
 
 _RANGE_NOISE_FIELDS = ("range_m", "range_per_m", "range_at_threshold_m")
-_MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not one of its beams
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -157,7 +156,7 @@ def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel
     source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
     estimates = measured.estimates
     notes = list(stack.notes)
-    if not _has_rings(base, stack):
+    if not base.matches_rings(stack.elevation_deg):
         notes.append(f"the recorded rings do not match the rings of {base.name}. Check `--model`")
     figures = {
         "versions": {"lidarpool": __version__},
@@ -175,12 +174,6 @@ def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel
         "curves": measured.curves(),
     }
     return Fit(figures, _with_performance(base, estimates, source) if estimates else base)
-
-
-def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
-    is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
-    return model.needs_calibration or is_near
 
 
 def _with_performance(

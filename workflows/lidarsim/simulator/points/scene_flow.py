@@ -88,8 +88,10 @@ def _later_times(survey: Survey, spec: ScanSpec, points: SurfacePoints) -> tuple
     has_next = (sweep + 1) % per_station != 0
     following = np.minimum(sweep + 1, len(sweeps.firsts) - 1)
     later_ns = points.times_ns + (sweeps.starts_ns[following] - sweeps.starts_ns[sweep])
+    # Of two complete sweeps, one can have one firing more than the other.
+    interval_ns = sweeps.starts_ns[following] - sweeps.stops_ns[sweep]
     last_firing_ns = sensor.beams.time_ns.max() - sensor.lead_ns + _ROUNDING_NS
-    has_next &= later_ns <= sweeps.stops_ns[following] + last_firing_ns
+    has_next &= later_ns <= sweeps.stops_ns[following] + interval_ns + last_firing_ns
     return sweep, np.where(has_next, later_ns, np.nan)
 
 
