@@ -225,6 +225,14 @@ def test_the_required_extent_of_the_terrain_is_sufficient():
     assert not notes(required_m)
 
 
+def test_holes_in_the_terrain_are_named(scanner):
+    halves = [quad(f"{x}", (x, -2e3, 0), (x + 1800, -2e3, 0), (x + 1800, 3e3, 0), (x, 3e3, 0))
+              for x in (-1000, 1200)]  # fmt: skip
+    plan = planned(scanner, shapely.box(0, 0, 2000, 900), Terrain(Scene.from_meshes(halves)))
+    (note,) = [note for note in plan.notes if "terrain is missing" in note]
+    assert note.endswith("Use a terrain that covers the area without holes")
+
+
 def test_what_cannot_be_planned(scanner):
     with pytest.raises(LidarError, match="no ground below line-1"):
         planned(scanner, terrain=Terrain(Scene.from_meshes([level("Far", middle=(9000, 0))])))
@@ -350,7 +358,8 @@ def test_areas_from_text_and_files(tmp_path):
     for content, epsg in (
         (polygon, 4326),
         (collection, 4326),
-        (polygon | {"crs": crs}, 25832),
+        ({"type": "Polygon", "coordinates": [[[5e5, 0], [6e5, 0], [6e5, 1e5], [5e5, 0]]]}
+         | {"crs": crs}, 25832),
     ):  # fmt: skip
         file.write_text(json.dumps(content))
         assert read_area(str(file)).epsg == epsg
@@ -365,11 +374,30 @@ def test_areas_from_text_and_files(tmp_path):
         ("POLYGON ((0 0, 10 0, 10 10))", "not closed. Repeat the first point at its end"),
         ("POLYGON ((0 0, 10 10, 10 0, 0 10, 0 0))", "not a valid polygon: Self-intersection"),
         ("missing.geojson", "missing.geojson does not exist"),
+        ("11.5,48.1,11.6,48.2", r"has an extent of 0\.1 x 0\.1 m\. WKT and bounds are in meters"),
     ],
 )
 def test_areas_that_are_invalid(text, words):
     with pytest.raises(LidarError, match=words):
         read_area(text)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ([1], "contains no GeoJSON object, which has the member `type`"),
+        ({"type": "FeatureCollection", "features": ["a"]}, "contains no GeoJSON object"),
+        (
+            {"type": "Polygon", "coordinates": [[[-180, 0], [180, 0], [180, 1], [-180, 0]]]},
+            "If it crosses the antimeridian, plan the parts on both sides separately",
+        ),
+    ],
+)
+def test_geojson_that_is_no_area(tmp_path, content, words):
+    file = tmp_path / "area.geojson"
+    file.write_text(json.dumps(content))
+    with pytest.raises(LidarError, match=words):
+        read_area(str(file))
 
 
 @pytest.mark.extended

@@ -255,9 +255,7 @@ def boxes():
 
 @pytest.mark.parametrize("side", [-4.5, np.nan, np.inf])
 def test_boxes_without_a_size_are_refused(side):
-    with pytest.raises(
-        ValueError, match=rf"size of box 7 \(Car\) must be positive.*{side:g} x"
-    ):
+    with pytest.raises(ValueError, match=rf"size of box 7 \(Car\) must be positive.*{side:g} x"):
         RecordedBoxes.from_rows([(0, 7, "Car", np.eye(4), (side, 1.8, 1.5))])
 
 

@@ -470,13 +470,17 @@ def _density_notes(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:
             "because it is hidden, or outside the swath over high ground. Increase `--overlap` or "
             "`--agl`, or follow the terrain with `--follow`"
         )
+        if plan.has_holes:
+            remedy = "above all because the terrain is missing, as noted above"
         if not plan.is_in_range:
             remedy = "because it is out of range or hidden. Change the height first, as noted above"
         yield (
             f"{max(density.empty, 0.001):.1%} of the area has no points in cells of "
             f"{density.cell_m:g} m, {remedy}"
         )
-    is_short = plan.density_m2 is None or plan.densities_m2[0] < 0.98 * plan.density_m2
+    is_short = (
+        plan.has_holes or plan.density_m2 is None or plan.densities_m2[0] < 0.98 * plan.density_m2
+    )
     if density.reached < 0.95 and not is_short:
         yield (
             f"{1 - density.reached:.0%} of the area has fewer than {plan.density_m2:g} points per "

@@ -62,6 +62,7 @@ class FlightPlan:
     density_m2: float | None  # requested density
     densities_m2: tuple[float, float]  # densities of a strip over the lowest and highest ground
     missing: float  # share of the samples without ground
+    has_holes: bool  # whether there are samples without ground in the area
     reach_m: float  # distance by which the strips extend beyond the area
     # Height above ground at which no ground is closer than the minimum range, or None if the
     # planned height is sufficient
@@ -217,6 +218,7 @@ def plan_flight(
         density_m2=density_m2,
         densities_m2=(rates.density_m2(wide_m), rates.density_m2(narrow_m)),
         missing=strips.missing,
+        has_holes=strips.has_holes,
         reach_m=strips.reach_m,
         required_agl_m=required_agl_m,
     )
@@ -345,7 +347,12 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
             f"Points are {plan.along_m:.2f} m apart along the track and {plan.across_m:.2f} m "
             f"across, because the {limit} scan frequency is {plan.rates.scan_hz:g} Hz. {remedy}"
         )
-    if plan.missing > 0.01:
+    if plan.has_holes:
+        yield (
+            "The terrain is missing below a part of the area. Use a terrain that covers the area "
+            "without holes"
+        )
+    elif plan.missing > 0.01:
         yield (
             f"The terrain is missing below {plan.missing:.0%} of the "
             f"{plural(len(plan.lines), 'strip')}. Use a terrain that extends beyond the area by "

@@ -17,6 +17,8 @@ from lidarsim.io.input_files import read_input_text
 GEOGRAPHIC = 4326  # EPSG code of longitudes and latitudes
 _GEOJSON = (".geojson", ".json")
 _WKT = (".wkt", ".txt")
+_MAX_WIDTH_DEG = 180.0  # a wider area crosses the antimeridian
+_MIN_EXTENT_M = 1.0  # a smaller area is in degrees
 _CRS_CODE = re.compile(r"(?:EPSG:{1,2}|EPSG/0/)(\d+)$", re.IGNORECASE)
 _CRS84 = re.compile(r"CRS84$", re.IGNORECASE)
 
@@ -74,6 +76,7 @@ def read_area(text: str) -> Area | None:
             geometries = [shapely.geometry.shape(geometry) for geometry in _geometries(content)]
             shape = shapely.union_all([g for g in geometries if "Polygon" in g.geom_type])
     _check_shape(shape, text)
+    _check_extent(shape, text, is_geographic=epsg == GEOGRAPHIC)
     return Area(shape, epsg)
 
 
@@ -103,8 +106,30 @@ def _check_shape(shape: Any, text: str) -> None:
         )
 
 
+def _check_extent(shape: Any, text: str, *, is_geographic: bool) -> None:
+    """Raise LidarError if an area is probably in another unit, or crosses the antimeridian."""
+    x0, y0, x1, y1 = shape.bounds
+    if is_geographic and x1 - x0 > _MAX_WIDTH_DEG:
+        raise LidarError(
+            f"The area {_shorten(text)} extends from {x0:g}° to {x1:g}° of longitude. If it "
+            "crosses the antimeridian, plan the parts on both sides separately."
+        )
+    if not is_geographic and max(x1 - x0, y1 - y0) < _MIN_EXTENT_M:
+        raise LidarError(
+            f"The area {_shorten(text)} has an extent of {x1 - x0:.3g} x {y1 - y0:.3g} m. WKT and "
+            "bounds are in meters. Use a GeoJSON file for longitudes and latitudes."
+        )
+
+
 def _geometries(content: Any) -> Iterator[Any]:
-    """Yield the geometries of a GeoJSON object."""
+    """Yield the geometries of a GeoJSON object.
+
+    Raise ValueError if the object is invalid. A feature may have no geometry.
+    """
+    if content is None:
+        return
+    if not isinstance(content, dict) or "type" not in content:
+        raise ValueError("it contains no GeoJSON object, which has the member `type`")
     kind = content["type"]
     if kind == "FeatureCollection":
         for feature in content["features"]:
@@ -120,7 +145,7 @@ def _geometries(content: Any) -> Iterator[Any]:
 
 def _geojson_epsg(content: Any) -> int:
     """Return the EPSG code of a GeoJSON object, which is 4326 unless it has the member `crs`."""
-    crs = content.get("crs")
+    crs = content.get("crs") if isinstance(content, dict) else None
     if crs is None:
         return GEOGRAPHIC
     name = crs["properties"]["name"]

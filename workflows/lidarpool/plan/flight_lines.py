@@ -93,6 +93,7 @@ class Strips(NamedTuple):
     clearances_m: Floats  # heights above ground below all strips, without NaN
     spacing_m: float | None  # distance between adjacent lines, or None for a single line
     missing: float  # share of the samples without ground
+    has_holes: bool  # whether samples in the area have no ground
     reach_m: float  # maximum distance of a sample from the area
 
 
@@ -130,6 +131,8 @@ def _place_lines(
 
     `narrow_m` is the height above ground at which strips have the requested overlap.
     """
+    import shapely
+
     swath_m = scanner.swath_m(narrow_m)
     margin_m = _MARGIN_M + scanner.ahead * layout.agl_m
     offsets = _offsets(area, layout.heading, swath_m, layout.overlap)
@@ -143,20 +146,26 @@ def _place_lines(
     _check_count(sum(map(len, tracks.values())))
     lines = []
     clearances = []
-    corners = []
+    samples = []
     for kind, ends in tracks.items():
         for number, (start, stop) in enumerate(ends, 1):
             points = _points_below(start, stop, scanner.swath_m(layout.agl_m))
             heights = terrain.heights(points.reshape(-1, 2)).reshape(points.shape[:2])
-            corners.append(points[[0, 0, -1, -1], [0, -1, 0, -1]])
+            samples.append(points.reshape(-1, 2))
             line = _line(f"{kind}-{number}", kind, start, stop, heights, scanner, layout)
             lines.append(line)
             clearances.append((line.leg.heights[:, None] - heights).ravel())
     above_m = np.concatenate(clearances)
+    below = np.concatenate(samples)
     is_missing = np.isnan(above_m)
-    spacing_m = float(offsets[1] - offsets[0]) if len(offsets) > 1 else None
-    reach_m = float(_distances_m(area, np.concatenate(corners)).max())
-    return Strips(lines, above_m[~is_missing], spacing_m, float(is_missing.mean()), reach_m)
+    return Strips(
+        lines,
+        above_m[~is_missing],
+        float(offsets[1] - offsets[0]) if len(offsets) > 1 else None,
+        float(is_missing.mean()),
+        bool(shapely.contains_xy(area, *below[is_missing].T).any()),
+        float(_distances_m(area, below).max()),
+    )
 
 
 def _line(
