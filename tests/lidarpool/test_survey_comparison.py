@@ -254,8 +254,23 @@ def test_returns_of_split_pulses_are_not_used_for_strips():
 def test_one_strip_and_strips_apart_are_refused():
     with pytest.raises(LidarError, match="contains 1 strip, and at least two are required"):
         compare_strips(cloud(plane(500)))
-    with pytest.raises(LidarError, match="No two of the 2 strips have comparable cells"):
+    with pytest.raises(LidarError, match="No two strips have cells of 1 m in common"):
         compare_strips(cloud(plane(500)), cloud(plane(500) + np.array([100, 0, 0])))
+
+
+@pytest.mark.parametrize(
+    ("cell_m", "noise_m", "says"),
+    [
+        (500.0, 0.0, r"in a small part of cells of 500 m, or on a line\. Reduce `--cell`"),
+        (2.0, 0.5, r"rougher than 0\.\d+ m\. Increase `--max-roughness`, or reduce `--cell`"),
+        (0.5, 0.0, r"fewer than 5 points of each strip\. Increase `--cell`"),
+    ],
+)
+def test_what_makes_strips_comparable_is_told(cell_m, noise_m, says):
+    noise = np.random.default_rng(3).normal(0, noise_m, (2, 500))
+    first, second = (plane(500) + [[0, 0, z] for z in heights] for heights in noise)
+    with pytest.raises(LidarError, match=says):
+        compare_strips(cloud(first), cloud(second), cell_m=cell_m)
 
 
 # -- what is refused, and files -------------------------------------------------------------------

@@ -116,12 +116,12 @@ def strip_deviations(clouds: Sequence[SurveyCloud], settings: StripSettings) -> 
             "files with different point source IDs."
         )
     names = grid.strips.names(clouds)
-    overlap = _overlaps(_merge_sums(grid.pending), len(names), settings)
+    cells = _merge_sums(grid.pending)
+    overlap = _overlaps(cells, len(names), settings)
     if not len(overlap.difference_m):
         raise LidarError(
-            f"No two of the {len(names):,} strips have comparable cells in common. Increase "
-            "`--cell` so that a cell contains at least 5 points of each strip, or increase "
-            "`--max-roughness`."
+            f"The heights of the {len(names):,} strips cannot be compared. "
+            + _why_incomparable(cells, overlap, settings)
         )
     figures = {
         "cell_m": settings.cell_m,
@@ -248,6 +248,32 @@ class _Overlap(NamedTuple):
     first: Ints  # (n,): number of the first strip
     second: Ints  # (n,)
     rough: int  # number of comparisons, by cell and pair, that are omitted because of roughness
+
+
+def _why_incomparable(cells: _CellSums, overlap: _Overlap, settings: StripSettings) -> str:
+    """Return sentences that explain why strips have no cells in common that can be compared."""
+    has_enough = cells.sums[:, 0] >= _MIN_POINTS
+    size = f"cells of {settings.cell_m:g} m"
+    if not _are_shared(cells.keys):
+        return (
+            f"No two strips have {size} in common. Check their coordinates, or increase `--cell`."
+        )
+    if not _are_shared(cells.keys[has_enough]):
+        return (
+            f"In {size}, there are fewer than {_MIN_POINTS} points of each strip. Increase "
+            "`--cell`."
+        )
+    if overlap.rough:
+        return (
+            f"The points in {size} are rougher than {settings.max_roughness_m:g} m. Increase "
+            "`--max-roughness`, or reduce `--cell`."
+        )
+    return f"The points are in a small part of {size}, or on a line. Reduce `--cell`."
+
+
+def _are_shared(keys: Ints) -> bool:
+    """Return whether there are keys of several strips in the same cell."""
+    return len(np.unique(keys >> 16)) < len(keys)
 
 
 def _cell_planes(cells: _CellSums, settings: StripSettings) -> _CellPlanes:
