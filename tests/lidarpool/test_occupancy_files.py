@@ -156,6 +156,7 @@ def test_jobs_of_campaigns(scenario):
         (["--layout", "occ3d", "--following", "2"], "only exist in the layout semantickitti"),
         (["--layout", "occ3d", "--voxel-size", "0.3"], "must be a multiple of the voxel size"),
         (["--layout", "occ3d", "--extent", "1,2,3"], "is not an extent"),
+        (["--layout", "occ3d", "--extent", "1,1,1,0,0,0"], "the lower corner must come first"),
         (["--layout", "occ3d", "--job", "1"], "can only be used with campaigns"),
         (["--layout", "occ3d", "--workers", "1", "--scheduler", "tcp://h:1"], "cannot be combined"),
     ],

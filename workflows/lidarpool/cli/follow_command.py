@@ -52,7 +52,7 @@ from .first_step import print_first_step
 )
 @click.option(
     "--assets",
-    type=click.Path(path_type=Path),
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
     metavar="FOLDER",
     help="Additional folder with files that WORLD uses.",
 )

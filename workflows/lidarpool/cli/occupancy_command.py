@@ -32,6 +32,11 @@ def _parse_extent(text: str) -> Corners:
             "-40,-40,-1,40,40,5.4."
         )
         raise click.BadParameter(message) from error
+    if not (x0 < x1 and y0 < y1 and z0 < z1):
+        raise click.BadParameter(
+            f"{text!r} is not an extent, because the lower corner must come first, as in "
+            "-40,-40,-1,40,40,5.4."
+        )
     return x0, y0, z0, x1, y1, z1
 
 
