@@ -24,6 +24,7 @@ from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD
 from lidarsim.io.archives import pack_arrays
+from lidarsim.scene.files.pcd import pcd_bytes
 
 # From axes of a lidar to those of a camera of KITTI: x to the right, y down, z forward.
 TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1.0]])
@@ -79,6 +80,17 @@ def test_files_are_in_the_order_of_the_numbers_in_their_names(tmp_path, folder, 
     for number in (3, 7, 0, 5, 1, 6, 4, 2):
         write(tmp_path / folder / f"{names[number]}{suffix}", number)
     assert first_x(open_recording(tmp_path)) == [*range(8)]
+
+
+def test_all_files_have_the_same_column_of_intensities(tmp_path):
+    for number, name in enumerate(("intensity", "i", "reflectivity")):
+        fields = [(field, np.ones(3, np.float32)) for field in ("x", "y", "z", name)]
+        content = pcd_bytes(fields, (0, 0, 0), (1, 0, 0, 0), "")
+        (tmp_path / f"{number}.pcd").write_bytes(content)
+    recording = open_recording(tmp_path)
+    assert recording[1].intensity.tolist() == [1, 1, 1]
+    with pytest.raises(LidarError, match=r"2\.pcd.*intensities are in reflectivity, but"):
+        recording[2]
 
 
 def test_the_digits_of_stamps_are_compared_to_the_last(tmp_path):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.column_names import STRENGTHS, with_standard_names
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.environment.extras import reading
@@ -101,7 +103,16 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         path = files[number]
         with reading(path.name) if len(files) > 1 else nullcontext():
             (sweep,) = read_pcd(path)
+            if number and (name := _intensity_name(sweep)) != first_intensity():
+                raise ValueError(
+                    f"its intensities are in {name or 'no column'}, but those of {files[0].name} "
+                    f"are in {first_intensity() or 'no column'}. Use files with the same columns"
+                )
         return sweep
+
+    @cache
+    def first_intensity() -> str | None:
+        return _intensity_name(read_pcd(files[0])[0])
 
     return source.recording(
         len(files),
@@ -110,6 +121,12 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         compensated=_stated_compensation(files[0]),
         files=[path.name for path in files],
     )
+
+
+def _intensity_name(sweep: Sweep) -> str | None:
+    """Return the name of the column from which the intensities of a sweep are read, or None."""
+    names = with_standard_names(sweep.columns)
+    return next((name for name in STRENGTHS if name in names), None)
 
 
 def _stated_compensation(path: Path) -> bool | None:
