@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from lidarsim.scene.colors import pack_as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
+from ..processes.per_process import PerProcess
 from .multi_file_format import MultiFileFormat
 from .recording import Recording, RecordingSource
 
@@ -110,10 +110,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
                 )
         return sweep
 
-    @cache
-    def first_intensity() -> str | None:
-        return _intensity_name(read_pcd(files[0])[0])
-
+    first_intensity = PerProcess(lambda: _intensity_name(read_pcd(files[0])[0]))
     return source.recording(
         len(files),
         read,
