@@ -30,7 +30,7 @@ demo:  ## the demo survey, then a drive through a city; results in $(OUT)/ and $
 # file stay together, for they share clusters; tests/conftest.py puts the longest files first.
 PYTEST := $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-test: dev  ## one test of each kind of behavior: six minutes
+test: dev  ## one test of each kind of behavior: five minutes
 	$(TIMED) $(PYTEST) $(MORE)
 
 test-all: dev  ## all tests but the slow ones: what CI runs

@@ -43,7 +43,7 @@ class StoragePath(click.Path):
 
 
 class Number(click.FloatRange):
-    """Parameter type for a finite number, which can be limited to a range."""
+    """Parameter type for a finite number, optionally within a range."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert text to a number, and refuse NaN and infinity."""

@@ -274,7 +274,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _check_same_grid(file: Path, info: bytes) -> None:
-    """Raise LidarError if a file exists that does not contain the description `info` of a grid."""
+    """Raise LidarError if the description file exists and differs from `info`."""
     with explain_os_errors(f"{file} cannot be read"):
         if file.exists() and file.read_bytes() != info:
             raise LidarError(

@@ -107,7 +107,7 @@ def _check_shape(shape: Any, text: str) -> None:
 
 
 def _check_extent(shape: Any, text: str, *, is_geographic: bool) -> None:
-    """Raise LidarError if an area is probably in another unit, or crosses the antimeridian."""
+    """Raise LidarError if an area is probably in degrees, or crosses the antimeridian."""
     x0, y0, x1, y1 = shape.bounds
     if is_geographic and x1 - x0 > _MAX_WIDTH_DEG:
         raise LidarError(

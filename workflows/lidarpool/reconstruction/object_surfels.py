@@ -83,7 +83,7 @@ def _reconstruct(
 
 
 def _are_on_ground(points: Floats, moved: Bools) -> Bools:
-    """Mark low points in the object frame that did not move."""
+    """Mark points in the object frame that are close to the ground and did not move."""
     return (points[:, 2] < _GROUND_M) & ~moved
 
 

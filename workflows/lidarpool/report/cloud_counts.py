@@ -137,7 +137,7 @@ class CloudCounts:
         return cell_positions(self._squares.box, self._precision_m, self._origin)
 
     def top_view(self) -> Squares:
-        """Return the points in squares of the size of pixels, for about one point per pixel."""
+        """Return the point counts for a top view, with about one point per pixel."""
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:

@@ -90,8 +90,8 @@ class SensorServer:
             port = self._server.add_insecure_port(str(address))
         except RuntimeError as error:
             raise LidarError(
-                f"The server cannot listen on {address}, because another program may use this "
-                "port. Pass another port with `--listen`."
+                f"The server cannot listen on {address}. Another program may be using this port. "
+                "Pass another port with `--listen`."
             ) from error
         self.address = address._replace(port=port)
 

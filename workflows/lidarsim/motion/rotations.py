@@ -127,7 +127,7 @@ def recorded_rotation(quaternion: Sequence[float], owner: str) -> Floats:
     Raises
     ------
     ValueError
-        If the quaternion does not have the length 1.
+        If the length of the quaternion is not 1, apart from rounding errors.
     """
     values = np.asarray(quaternion, np.float64)
     length = float(np.sqrt((values * values).sum()))

@@ -346,8 +346,8 @@ class SensorModel(_ModelSection):
     def matches_rings(self, elevation_deg: Floats) -> bool:
         """Return whether recorded rings with the given elevations can be those of the model.
 
-        The elevations in degrees have shape (n,). Some beams may have no ring, because they
-        returned nothing, but not most of them.
+        The elevations in degrees have shape (n,). Beams without returns have no ring, but at least
+        a quarter of the beams must have one.
         """
         if not len(elevation_deg) or self.needs_calibration:
             return True

@@ -126,7 +126,7 @@ _Mark = tuple[float, float, int]
 
 
 def _station_marks(result: RunResult, top_view: Squares) -> list[_Mark]:
-    """Return markers for the stations of a stationary sensor that are within the top view."""
+    """Return markers for the stations of a stationary sensor that lie within the top view."""
     survey = result.survey
     if survey.coordinates != "world" or survey.path.moves or not len(result.points):
         return []
