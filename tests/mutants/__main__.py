@@ -24,22 +24,6 @@ from tests.mutants.lines import Lines
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "build" / "mutants"
-# What decides values that users get, or which process gets which task.
-PACKAGES = [
-    *("workflows/lidarsim/" + name for name in (
-        "simulator", "motion", "media", "sensor", "sensor_files", "packets", "columns", "sweeps",
-        "survey", "scene", "numerics/random_numbers.py", "numerics/vectors.py", "io/tables.py",
-    )),
-    "kernels/raybeam",
-    "scheduler/poolpart",
-    "workflows/lidarscenes/files",
-    "workflows/lidarscenes/roads",
-    *("workflows/lidarpool/" + name for name in (
-        "clouds", "comparing", "reconstruction", "plan", "columns", "datasets", "recordings",
-        "run/pipeline", "run/store", "scenario/campaign_sections.py", "scenario/campaign_jobs.py",
-        "report/merging.py", "report/growing_cloud.py", "identity/shard.py",
-    )),
-]  # fmt: skip
 _FIRST_S = 10.0  # estimated time of the tests that are tried first
 _EXTRA_S = 120.0  # a fault that makes tests this much slower counts as noticed
 
@@ -87,7 +71,7 @@ def main() -> None:
             if not row["noticed"]
         ]
     else:
-        faults = choose(ROOT, options.packages or PACKAGES, options.count, options.seed)
+        faults = choose(ROOT, options.packages or ROOTS, options.count, options.seed)
     outcomes = []
     out = options.out or FOLDER / f"{options.seed}.json"
     with _places(options.jobs) as places, ThreadPoolExecutor(options.jobs) as pool:
@@ -106,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "packages",
         nargs="*",
-        help="Folders or files to plant faults in (default: what decides values).",
+        help="Folders or files to plant faults in (default: all, except SKIPPED_MODULES).",
     )
     add(
         "--seed", type=int, default=int(time.time()), help="Seed of the choice (default: the time)."

@@ -1,9 +1,13 @@
 """Test that faults are found where values are computed, and are planted one at a time."""
 
 import ast
+from pathlib import Path
 
 import pytest
-from tests.mutants.faults import choose, faults_in, function_spans
+from tests.mutants import faults
+from tests.mutants.faults import choose, faults_in, function_spans, modules
+
+PROJECT = Path(__file__).parents[2]
 
 SOURCE = '''
 """Lengths."""
@@ -54,8 +58,8 @@ def test_faults_of_expressions(root):
 
 
 def test_a_planted_fault_changes_one_expression(root):
-    faults = faults_in(root, "kernels/lines.py")
-    for fault in faults:
+    found = faults_in(root, "kernels/lines.py")
+    for fault in found:
         planted = fault.plant(SOURCE)
         ast.parse(planted)
         changed = [
@@ -64,8 +68,8 @@ def test_a_planted_fault_changes_one_expression(root):
             if old != new
         ]
         assert len(changed) == 1 and fault.after in changed[0][1]
-    assert {fault.function for fault in faults} == {"Line.length", "double"}
-    assert [fault.compiled for fault in faults if fault.function == "double"] == [True]
+    assert {fault.function for fault in found} == {"Line.length", "double"}
+    assert [fault.compiled for fault in found if fault.function == "double"] == [True]
 
 
 def test_a_fault_that_no_longer_fits_is_refused(root):
@@ -87,3 +91,24 @@ def test_spans_of_functions():
         "Line.__repr__": (15, 15),
         "double": (20, 21),
     }
+
+
+def test_packages_that_are_added_are_included(tmp_path):
+    for path in ["kernels", "scheduler", "workflows/new/inner", "workflows/lidarpool/cli"]:
+        (tmp_path / path).mkdir(parents=True)
+    added = ["workflows/new/inner/values.py", "workflows/lidarpool/new.py"]
+    skipped = ["workflows/lidarpool/cli/options.py", "workflows/lidarpool/new_charts.py"]
+    for path in [*added, *skipped]:
+        (tmp_path / path).write_text(SOURCE)
+    assert modules(tmp_path) == sorted(added)
+    with pytest.raises(ValueError, match="no package or file 'workflows/nwe'"):
+        modules(tmp_path, ["workflows/nwe"])
+
+
+def test_each_skipped_module_exists(monkeypatch):
+    number = len(modules(PROJECT))
+    for pattern in faults.SKIPPED_MODULES:
+        others = [other for other in faults.SKIPPED_MODULES if other != pattern]
+        monkeypatch.setattr(faults, "SKIPPED_MODULES", others)
+        assert len(modules(PROJECT)) > number, pattern
+        monkeypatch.undo()
