@@ -74,15 +74,17 @@ ENCODINGS = ("ascii", "binary", "binary_compressed")
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_padding_and_fields_of_several_numbers(tmp_path, encoding):
-    names = ["x", "y", "z", "_", "intensity", "ring", "_", "normal", "stamp"]
-    kinds = ["f4", "f4", "f4", "u1", "f4", "u2", "u1", "f4", "u8"]
-    counts = [1, 1, 1, 4, 1, 1, 10, 3, 1]
+    # Fields with a COUNT of 0 occupy no bytes.
+    names = ["x", "y", "z", "_", "intensity", "_", "ring", "_", "normal", "none", "stamp"]
+    kinds = ["f4", "f4", "f4", "u1", "f4", "u1", "u2", "u1", "f4", "f4", "u8"]
+    counts = [1, 1, 1, 4, 1, 0, 1, 10, 3, 0, 1]
+    nothing = np.empty((COUNT, 0))
     ring = np.arange(COUNT, dtype="u2")
     stamp = np.arange(COUNT, dtype="u8") + 2**63 + 1
     normal = RNG.normal(size=(COUNT, 3)).astype("f4")
     columns = [
-        X, Y, Z, np.full((COUNT, 4), 7, "u1"), X / 2, ring, np.full((COUNT, 10), 9, "u1"), normal,
-        stamp,
+        X, Y, Z, np.full((COUNT, 4), 7, "u1"), X / 2, nothing, ring, np.full((COUNT, 10), 9, "u1"),
+        normal, nothing, stamp,
     ]  # fmt: skip
     for without_padding in (False, True):
         content = encoded(encoding, names, kinds, columns, counts, without_padding)
@@ -213,9 +215,11 @@ GOOD = header([*"xyz"], ["f4"] * 3, 2, "ascii") + b"1 2 3\n4 5 6\n"
         (b"FIELDS x y z", b"FIELDS x y w", "its FIELDS are x, y, w.*has no z"),
         (b"FIELDS x y z\n", b"", "its header has no FIELDS"),
         (b"SIZE 4 4 4", b"SIZE 4 4", "its header has 3 entries in FIELDS, but 2 in SIZE"),
-        (b"SIZE 4 4 4", b"SIZE 4 3 4", "its field 'y' has TYPE F, SIZE 3 and COUNT 1"),
+        (b"SIZE 4 4 4", b"SIZE 4 3 4", "its field 'y' has TYPE F and SIZE 3. Expected F with 4"),
         (b"TYPE F F F", b"TYPE F F X", "its field 'z' has TYPE X"),
         (b"COUNT 1 1 1", b"COUNT 1 -1 1", "is 'COUNT 1 -1 1'. Expected whole numbers"),
+        (b"COUNT 1 1 1", b"COUNT 1 0 1", r"line 12 has 3 cells, but 2 were expected \(x, z\)"),
+        (b"COUNT 1 1 1", b"COUNT 0 0 0", "its header has a COUNT of 0 for all fields"),
         (b"COUNT 1 1 1", b"COUNT 2 1 1", r"line 12 has 3 cells, but 4 were expected \(x_0, x_1, y"),
         (b"WIDTH 2", b"WIDTH 3", "2 POINTS, but a WIDTH of 3 by a HEIGHT of 1"),
         (b"WIDTH 2", b"WIDTH two", "line 7 of its header is 'WIDTH two'. Expected a whole number"),

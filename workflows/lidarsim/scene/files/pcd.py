@@ -221,20 +221,22 @@ def _fields(entries: _Entries) -> list[_Field]:
             raise ValueError(
                 f"its header has {len(names)} entries in FIELDS, but {len(words)} in {keyword}"
             )
-    for name, letter, size, count in zip(names, letters, sizes, counts, strict=True):
-        if (letter, size) not in _KINDS or count < 1:
+    for name, letter, size in zip(names, letters, sizes, strict=True):
+        if (letter, size) not in _KINDS:
             raise ValueError(
-                f"its field {printable(name)[:40]!r} has TYPE {letter[:20]}, SIZE {size} and "
-                f"COUNT {count}. Expected F with 4 or 8 bytes, or I or U with 1, 2, 4 or 8 bytes, "
-                "and a COUNT of at least 1"
+                f"its field {printable(name)[:40]!r} has TYPE {letter[:20]} and SIZE {size}. "
+                "Expected F with 4 or 8 bytes, or I or U with 1, 2, 4 or 8 bytes"
             )
     if (numbers := sum(counts)) > _MAX_NUMBERS:
         raise ValueError(
             f"its header declares {numbers:,} numbers per point, but the limit is {_MAX_NUMBERS:,}"
         )
+    if not numbers:
+        raise ValueError("its header has a COUNT of 0 for all fields")
     return [
         _Field(name, _KINDS[letter, size], count)
         for name, letter, size, count in zip(names, letters, sizes, counts, strict=True)
+        if count  # padding without numbers, which some sensor software writes
     ]
 
 
