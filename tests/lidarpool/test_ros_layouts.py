@@ -317,8 +317,17 @@ def test_fields_of_several_numbers_and_of_the_same_name():
     assert [*columns] == ["x", "y", "z", "n_0", "n_1", "n_2", "ring", "ring_2"]
     assert columns["z"].tolist() == [3, 6] and columns["n_1"].tolist() == [8, 11]
     assert columns["ring"].tolist() == [0, 0] and columns["ring_2"].tolist() == [5, 5]
-    with pytest.raises(ValueError, match="'n' has 4,000,000,000 numbers starting at byte 12"):
-        point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
+    for datatype, count, numbers in (
+        (7, 4_000_000_000, "4,000,000,000 numbers of 4 bytes starting at byte 12"),
+        (7, 5, "5 numbers of 4 bytes starting at byte 12"),
+        (8, 3, "3 numbers of 8 bytes starting at byte 12"),
+    ):
+        with pytest.raises(ValueError, match=f"'n' has {numbers}, but a point has only 28 bytes"):
+            point_columns(point_cloud(rows, [*axes, ("n", 12, datatype, count)]))
+    with pytest.raises(ValueError, match="'ring' has 1 number of 4 bytes starting at byte 26, but"):
+        point_columns(point_cloud(rows, [*axes, ("ring", 26, 6, 1)]))
+    whole = point_columns(point_cloud(rows, [*axes, ("n", 12, 8, 2)]))  # ends with the point
+    assert [*whole] == ["x", "y", "z", "n_0", "n_1"] and whole["n_1"].dtype.itemsize == 8
     for datatype, count in ((0, 1), (9, 1), (7, 0)):
         says = f"its field 'n' has datatype {datatype} and count {count}, but a PointField has"
         with pytest.raises(ValueError, match=says):

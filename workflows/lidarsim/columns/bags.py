@@ -14,7 +14,7 @@ from ..environment.extras import reading, require_package
 from ..errors import CutShortError, LidarError
 from ..io.input_files import input_size
 from ..numerics.arrays import AnyArray, Records
-from ..words import make_distinct, printable
+from ..words import make_distinct, plural, printable
 from .mcap_chunks import check_chunks, check_packed
 
 if TYPE_CHECKING:
@@ -157,10 +157,13 @@ def point_rows(message: Any) -> Records:
                 f"{field.count}, but a PointField has datatypes 1 to {len(kinds)} and a count of "
                 "at least 1. Record it again with a driver that sets both"
             )
-        if field.offset + field.count > message.point_step:  # a number has at least one byte
+        size = np.dtype(kinds[field.datatype]).itemsize
+        if field.offset + field.count * size > message.point_step:
             raise ValueError(
-                f"its field {printable(field.name)!r} has {field.count:,} numbers starting at "
-                f"byte {field.offset:,}, but a point has only {message.point_step:,} bytes"
+                f"its field {printable(field.name)!r} has {plural(field.count, 'number')} of "
+                f"{plural(size, 'byte')} starting at byte {field.offset:,}, but a point has only "
+                f"{message.point_step:,} bytes. Record it again with a driver that sets point_step "
+                "to the size of a point"
             )
     numbers = [
         (field.name if field.count == 1 else f"{field.name}_{index}", field, index)
