@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from functools import partial
 
 import mcap.reader
@@ -366,6 +367,51 @@ def test_all_other_records_keep_their_bytes(written, tmp_path, kind):
         expected = boxed(rewriter.recording, number).sweep.points
         np.testing.assert_allclose(recording[number].points, expected, rtol=1e-6)
     assert path.read_bytes() == before
+
+
+def with_channel_zero(path):
+    """Subtract 1 from the channel IDs of a file without chunks. Only schema IDs must not be 0."""
+    data = bytearray(path.read_bytes())
+    position = len(mcap.writer.MCAP0_MAGIC)
+    while position < len(data) - len(mcap.writer.MCAP0_MAGIC):
+        kind, length = struct.unpack_from("<BQ", data, position)
+        if kind in (0x04, 0x05):  # channels and messages
+            (number,) = struct.unpack_from("<H", data, position + 9)
+            struct.pack_into("<H", data, position + 9, number - 1)
+        position += 9 + length
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("has_summary", [True, False])
+def test_channel_zero(written, tmp_path, has_summary):
+    path = plain_copy(
+        written("mcap"),
+        tmp_path / "source.mcap",
+        use_chunking=False,
+        use_statistics=False,
+        enable_crcs=False,
+        index_types=mcap.writer.IndexType.NONE,
+        use_summary_offsets=False,
+        repeat_channels=has_summary,
+        repeat_schemas=has_summary,
+    )
+    with_channel_zero(path)
+    before, _, _, summary = records(path)
+    assert 0 in {channel for _, channel, *_ in before}
+    assert bool(summary and summary.channels) == has_summary
+    rewriter = opened(path)
+    rewrite(rewriter, tmp_path / "same.mcap", tmp_path / "work", identity)
+    assert records(tmp_path / "same.mcap")[0] == before
+    boxed = partial(changed, boxes=two_boxes())
+    rewrite(rewriter, tmp_path / "new.mcap", tmp_path / "work2", boxed)
+    topics = (TOPIC, "/augmented_objects")
+    found, *_, summary = records(tmp_path / "new.mcap", topics)
+    assert found == records(path, topics)[0]
+    assert 0 not in summary.schemas and 0 in summary.channels
+    recording = open_recording(tmp_path / "new.mcap", TOPIC, keep_noise=True)
+    for number in range(3):
+        expected = boxed(rewriter.recording, number).sweep.points
+        np.testing.assert_allclose(recording[number].points, expected, rtol=1e-6)
 
 
 def test_bags_of_several_files(written, tmp_path):

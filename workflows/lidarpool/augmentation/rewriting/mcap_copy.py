@@ -155,8 +155,8 @@ class _Copy:
     _schemas: dict[int, bytes] = field(default_factory=dict)
     _channels: dict[int, bytes] = field(default_factory=dict)
     _has_summary: bool = False
-    _added_id: int = 0  # ID of the schema and the channel of the added topic
-    _is_added: bool = False  # whether the schema and the channel of the added topic are written
+    # ID of the schema and the channel of the added topic. None before the first of its messages.
+    _added_id: int | None = None
     _chunks: list[bytes] = field(default_factory=list)
     _attachments: list[bytes] = field(default_factory=list)
     _metadata: list[bytes] = field(default_factory=list)
@@ -175,8 +175,6 @@ class _Copy:
         for kind, begin, stop in _records(self.data, start, size - len(_MAGIC)):
             self._define(kind, self.data[begin:stop])
         self._has_summary = bool(self._channels)
-        used = self._schemas.keys() | self._channels.keys()
-        self._added_id = next(number for number in range(_MAX_ID, 0, -1) if number not in used)
 
     def _define(self, kind: int, content: bytes) -> None:
         """Remember a schema or a channel."""
@@ -277,18 +275,24 @@ class _Copy:
         messages.add(channel, sequence, log_time, publish_time, data if new is None else new.data)
         if new is None or new.added is None or self.added is None:
             return
-        if not self._is_added:
-            self._is_added = True
-            self._schemas[self._added_id] = _ID.pack(self._added_id) + b"".join(
-                map(_text, (self.added.type, "ros2msg", self.added.definition))
-            )
-            qos = _text("offered_qos_profiles") + _text(self.added.qos)
-            self._channels[self._added_id] = (
-                2 * _ID.pack(self._added_id) + _text(self.added.topic) + _text("cdr") + _text(qos)
-            )
-            messages.content += _record(_SCHEMA, self._schemas[self._added_id])
-            messages.content += _record(_CHANNEL, self._channels[self._added_id])
+        if self._added_id is None:
+            self._added_id = self._add_topic(self.added, messages)
         messages.add(self._added_id, sequence, log_time, publish_time, new.added)
+
+    def _add_topic(self, added: AddedTopic, messages: _Messages) -> int:
+        """Define the added topic, and return the unused ID of its schema and its channel."""
+        used = self._schemas.keys() | self._channels.keys()
+        number = next(number for number in range(_MAX_ID, 0, -1) if number not in used)
+        self._schemas[number] = _ID.pack(number) + b"".join(
+            map(_text, (added.type, "ros2msg", added.definition))
+        )
+        qos = _text("offered_qos_profiles") + _text(added.qos)
+        self._channels[number] = (
+            2 * _ID.pack(number) + _text(added.topic) + _text("cdr") + _text(qos)
+        )
+        messages.content += _record(_SCHEMA, self._schemas[number])
+        messages.content += _record(_CHANNEL, self._channels[number])
+        return number
 
     def _write_chunk(self, chunk: _Chunk, indices: list[bytes]) -> None:
         """Write a chunk and its message indices."""
