@@ -33,7 +33,13 @@ from lidarpool import (
 )
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.rendering import MAX_ROWS, insert_picture, sentence, write_page
+from lidarpool.report.page.rendering import (
+    MAX_ROWS,
+    draw_top_view,
+    insert_picture,
+    sentence,
+    write_page,
+)
 from lidarpool.report.report import make_report
 from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.run.pipeline.task_book import TaskBook
@@ -198,7 +204,13 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     corners = np.array([(-1, -1, 0), (9, -1, 0), (-1, 4, 0.0)])  # the sensors stand at x of 0 and 1
     columns = {name: np.zeros(3, np.int32) for name in ("scan", "channel", "object")}
     page = html.fromstring(write(cloud=Cloud(corners, columns))[0])
-    marks = [(float(c.get("cx")), float(c.get("cy"))) for c in page.xpath("//circle")]
+    marks = [
+        tuple(
+            float(r.get(edge)) + float(r.get(side)) / 2
+            for edge, side in (("x", "width"), ("y", "height"))
+        )
+        for r in page.xpath("//g[@class='stations']/rect")
+    ]
     assert page.xpath("//g[@class='stations']/text/text()") == ["1", "2"]
     (size,) = page.xpath("//image")
     rows = int(size.get("height"))
@@ -207,7 +219,14 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     assert second - first == pytest.approx(pixels, abs=0.11)
     assert pixels - 0.1 <= first <= pixels + 1.1
     assert y == other_y and rows - pixels - 1.1 <= y <= rows - pixels + 0.1
-    assert "the sensor positions in red" in page.text_content()
+    assert "with the numbers of the sensor positions" in page.text_content()
+
+
+def test_stations_above_each_other_share_a_mark_with_all_their_numbers():
+    marks = [(8, 8, 1), (8, 8, 2), (8, 8.1, 3), (20, 8, 4), (20, 8, 6), (30, 20, 5)]
+    page = html.fromstring(draw_top_view(np.ones((30, 40)), marks=marks))
+    texts = page.xpath("//g[@class='stations']/text")
+    assert {t.text: float(t.get("x")) for t in texts} == {"1–3": 8.0, "4, 6": 20.0, "5": 30.0}
 
 
 @pytest.mark.extended

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import html
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
@@ -29,7 +30,7 @@ from lidarview.render.pictures import draw_cloud, draw_hits, draw_points, draw_s
 from lidarview.render.shot import GROUND, SKY, take_shot
 from lidarview.render.stage import make_axis, nice_step
 from lidarview.render.surface import separate_objects
-from lidarview.render.theme import object_colors
+from lidarview.render.theme import SENSOR, object_colors
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend
@@ -446,3 +447,23 @@ def test_the_hall_stays_closed_where_the_sensor_is_outside():
     roof_seen = row_shot.project_visible([[0, 0, 4.0]])[1]
     floor_seen = row_shot.project_visible([[-3, -5, 0.3]])[1]
     assert roof_seen.all() and not floor_seen.any()
+
+
+def test_the_legend_names_the_largest_twelve_groups_and_counts_the_others():
+    boxes = [block(f"box {k}", (0.1 + 0.01 * k,) * 3, (k % 5, k // 5, 0.0)) for k in range(20)]
+    page = draw_scene(take_shot(Scene.from_meshes(boxes), [], size=SIZE, backend="numpy"), 9)
+    (legend,) = page.figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts == [*(str(k) for k in range(8, 20)), "8 other objects"]
+    faces = {tuple(np.round(to_rgb(h.get_color()), 3)) for h in legend.legend_handles}
+    assert len(faces) == 13
+
+
+def test_rays_have_a_row_in_the_legend_and_no_color_of_the_scale(scene):
+    shot = take_shot(scene, [[0, 0, 2]], size=SIZE, backend="numpy")
+    page = draw_hits(shot, np.ones(len(scene.faces), np.int64), NOWHERE, NONE)
+    (legend,) = page.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "Sensor position", "Some of the rays",
+    ]  # fmt: skip
+    assert np.abs(TURBO - to_rgb(SENSOR)).max(axis=1).min() > 0.2

@@ -235,7 +235,7 @@ def _draw_ring_residuals(
     axes.axvline(0, color=theme.MUTED, lw=0.7 * page.unit)
     size = _marker_size(page, rings)
     axes.plot(median, elevation, "o", color=A_COLOR, ms=size, mew=0, label="median")
-    mean_style: dict[str, Any] = {"color": theme.SENSOR, "ms": 2 * size, "mew": 0.8 * page.unit}
+    mean_style: dict[str, Any] = {"color": theme.EMPHASIS, "ms": 2 * size, "mew": 0.8 * page.unit}
     axes.plot(mean, elevation, "|", label="mean", **mean_style)
     axes.set_xlim(-limit, limit)
     _draw_legend(page, axes)

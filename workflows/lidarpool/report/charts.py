@@ -263,7 +263,7 @@ def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Ite
     counts, *_ = axes.hist(scale.known_values, edges, rwidth=bar_width)
     for bar, color in zip(axes.patches, cycle(colors)):
         bar.set_facecolor(color)
-    axes.hist(failed, edges, rwidth=bar_width, color=theme.SENSOR)
+    axes.hist(failed, edges, rwidth=bar_width, color=theme.EMPHASIS)
     axes.set_ylim(0, 1.1 * max(1, np.max(counts)))
 
 
@@ -301,7 +301,7 @@ def _draw_points(
         np.zeros(len(failed)),
         marker="x",
         s=18 * unit**2,
-        color=theme.SENSOR,
+        color=theme.EMPHASIS,
         linewidths=0.9 * unit,
         clip_on=False,
         zorder=5,

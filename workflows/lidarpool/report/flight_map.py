@@ -22,7 +22,7 @@ from ..plan.flight_lines import FlightLine
 SIZE = (1600, 1000)
 _FRAME = (0.075, 0.10, 0.755, 0.735)  # left, bottom, width and height of the map
 _MARGIN = 0.04  # margin around the lines and the area, as a fraction of their extent
-_LINE_COLOR = theme.SENSOR
+_LINE_COLOR = theme.EMPHASIS
 _CROSS_COLOR = "#ee7733"
 _AREA_COLOR = theme.INK
 _COLORMAP = "viridis"

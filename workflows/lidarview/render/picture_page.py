@@ -341,17 +341,24 @@ class Page:
         axes.set_title(text, loc="left", parse_math=False, **style)
 
     def legend(
-        self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor", **options: Any
+        self,
+        entries: Sequence[tuple[str, Any]],
+        sensor: str = "Sensor",
+        rays: str = "",
+        **options: Any,
     ) -> None:
         """Draw a legend in the right margin.
 
         `entries` contains tuples (name, color). If there are more than `LEGEND_ROWS`, the last line
-        states the number of omitted entries. `sensor` is the label of the sensor marker, which is
-        omitted if the label is empty. The options are passed to `key`.
+        states the number of omitted entries. `sensor` and `rays` are the labels of the sensor
+        marker and of the rays, which are omitted if their labels are empty. The options are passed
+        to `key`.
         """
         rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:
             rows.append(("o", sensor, theme.SENSOR))
+        if rays:
+            rows.append(("_", rays, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
             rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
         size = min(7.4, 175 / len(rows))
@@ -363,8 +370,9 @@ class Page:
                     ls="",
                     marker=marker,
                     color=color,
-                    ms=0.85 * size * self.unit,
-                    mec="none",
+                    ms=(1.6 if marker == "_" else 0.85) * size * self.unit,
+                    mec=color if marker == "_" else "none",
+                    mew=0.8 * self.unit,
                     label=shorten_name(name),
                 )
                 for marker, name, color in rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from textwrap import fill
 
 import numpy as np
@@ -12,12 +12,13 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, Column, Z
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
 from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.words import plural, remove_common_prefix
 
 from . import theme
 from .coloring import TURBO, column_values, make_coloring
 from .hit_density import hit_colors, hits_title
-from .picture_page import LEGEND_ROWS, Page, robot_name
+from .picture_page import Page, robot_name
 from .shot import SurfaceView
 
 MAX_POINTS = 1_000_000  # maximum number of drawn points; a picture has only a few more pixels
@@ -29,14 +30,16 @@ MAX_RAYS = 600
 MAX_RAYS_OF_PATHS = 150
 # An object that covers this fraction of the ground is a floor or a hall.
 MIN_FLOOR_SHARE = 0.6
+MAX_COLORED = 12  # groups of objects with colors of their own; more could not be told apart
+_OTHERS = "#9fb0bf"
 
 
 def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     """Draw a scene and its sensors, with a separate color for each object.
 
-    If a scene has more objects than a legend has rows, copies of an object share a color. A scene
-    with colors is drawn in these colors, without a legend. `triangles` is the number of triangles
-    in the caption.
+    If a scene has more than `MAX_COLORED` objects, copies of an object share a color, and so do the
+    smallest objects. A scene with colors is drawn in these colors, without a legend. `triangles` is
+    the number of triangles in the caption.
     """
     scene = shot.scene
     words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
@@ -46,22 +49,23 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
         page.title("Scene", f"{words} · {shot.caption}", shot.models)
         return page
     kinds, names = _group_objects(scene.names, shot.actors)
-    colors = _object_colors(scene, kinds)
+    largest = _largest_groups(scene, kinds, shot.actors)
+    colors = _object_colors(scene, kinds, largest)
     page = Page(shot.camera.size)
     page.draw_view(shot, shot.paint(colors[scene.face_object]))
-    has_faces = np.bincount(scene.face_object, minlength=len(kinds)) > 0
-    _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
-    labels = [
-        name if count == 1 else f"{name} ({count:,})"
-        for name, count in zip(remove_common_prefix(names), counts, strict=True)
+    first = len(names) - shot.actors
+    entries = [
+        (name if count == 1 else f"{name} ({count:,})", colors[object_index])
+        for name, object_index, count in zip(
+            remove_common_prefix(names), *_members(kinds), strict=True
+        )
     ]
-    first = len(names) - shot.actors  # the legend starts with the actors
-    is_visible = np.bincount(kinds, has_faces) > 0
-    order = [*range(first, len(names)), *range(first)]
-    if is_visible.sum() > LEGEND_ROWS:
-        order.sort(key=lambda k: k < first and counts[k] == 1)  # followed by copies
-    entries = [(labels[k], colors[firsts[k]]) for k in order if is_visible[k]]
-    page.legend(entries, _sensor_label(shot))
+    shown = [k for k in (*range(first, len(names)), *range(first)) if k in largest]  # actors first
+    others = ~np.isin(np.unique(scene.face_object), np.flatnonzero(np.isin(kinds, shown)))
+    legend = [entries[k] for k in shown]
+    if others.any():
+        legend.append((plural(int(others.sum()), "other object"), theme.rgb(_OTHERS)))
+    page.legend(legend, _sensor_label(shot))
     page.title("Scene", f"{words} · {shot.caption}", shot.models)
     return page
 
@@ -94,8 +98,8 @@ def draw_hits(
     axes = page.draw_view(shot, shot.subdivide(pieces, owner).paint(colors, 0.5))
     page.draw_lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
     page.color_bar(TURBO, LogNorm(*limits), hits_title(limits))
-    if label := _sensor_label(shot):
-        page.legend([], label, bbox_to_anchor=(0.842, 0.18))  # below the color bar
+    if label := _sensor_label(shot):  # below the color bar
+        page.legend([], label, rays="Some of the rays", bbox_to_anchor=(0.842, 0.17))
     page.title("Hits", f"{plural(round(hit_counts.sum()), 'hit')} · {shot.caption}", shot.models)
     return page
 
@@ -175,7 +179,7 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
     Copies of an object form a group, and so do the links of a robot. The last `actors` objects are
     actors. Returns the group (objects,) of each object, and the names of the groups.
     """
-    if len(names) <= LEGEND_ROWS:
+    if len(names) <= MAX_COLORED:
         return np.arange(len(names)), list(names)
     known_names = {*names}
     numbers = dict[str, int]()
@@ -189,19 +193,39 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
     return np.array(kinds), list(numbers)
 
 
-def _object_colors(scene: Scene, kinds: Ints) -> Floats:
+def _members(kinds: Ints) -> tuple[Ints, Ints]:
+    """Return the first object and the number of objects of each group."""
+    _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
+    return firsts, counts
+
+
+def _largest_groups(scene: Scene, kinds: Ints, actors: int) -> set[int]:
+    """Return the `MAX_COLORED` groups with the largest surfaces, preferably actors.
+
+    The last `actors` objects are actors. Groups without a surface are not included.
+    """
+    areas = triangle_areas(scene.vertices[scene.faces])
+    sizes = np.bincount(kinds[scene.face_object], areas, minlength=int(kinds.max()) + 1)
+    is_actor = np.isin(np.arange(len(sizes)), kinds[len(kinds) - actors :])
+    largest = np.lexsort((-sizes, ~is_actor))[:MAX_COLORED]
+    return set(largest[sizes[largest] > 0].tolist())
+
+
+def _object_colors(scene: Scene, kinds: Ints, colored: Set[int]) -> Floats:
     """Return the colors of a scene's objects.
 
-    All objects in a group have the same color. Floors and halls are gray, so that the objects
-    inside stand out.
+    All objects in a group have the same color, and so do all objects whose group is not `colored`.
+    Floors and halls are gray, so that the objects inside stand out.
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     scene_size = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
     fraction = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
     gray = (fraction >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
     colors = np.empty((len(scene.names), 3))
-    kind_numbers, kind = np.unique(kinds[~gray], return_inverse=True)
-    colors[~gray] = theme.object_colors(len(kind_numbers))[kind]
+    colors[:] = theme.rgb(_OTHERS)
+    distinct = ~gray & np.isin(kinds, list(colored))
+    kind_numbers, kind = np.unique(kinds[distinct], return_inverse=True)
+    colors[distinct] = theme.object_colors(len(kind_numbers))[kind]
     steps = np.linspace(0, 0.22, max(int(gray.sum()), 1))[: int(gray.sum()), None]
     colors[gray] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
     return colors

@@ -18,20 +18,25 @@ INK = "#1c2430"
 MUTED = "#5d6876"
 CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
-SENSOR = "#e0182d"
+SENSOR = "#101317"  # sensors, paths and rays; no color scale contains it
+EMPHASIS = "#e0182d"
 RANGE_COLORS = "viridis_r"  # colormap of range images, in which short ranges are yellow
 VEIL = 0.085  # opacity of MUTED over the page, which is the color of the ground
 # In pictures within an HTML page, the style sheet of the page defines these colors.
 STYLED = {
     PAGE: "page", GROUND: "ground", LINE: "line", INK: "ink", MUTED: "muted", UNSEEN: "unseen",
-    SENSOR: "sensor",
+    SENSOR: "sensor", EMPHASIS: "emphasis",
 }  # fmt: skip
 
-# The colors are distinct even for most color-blind readers. They follow the "bright" and "muted"
-# sets by Paul Tol (2021), in an order that keeps neighbors distinct.
+# The first twelve colors are distinct even for most color-blind readers. They follow the "bright"
+# and "muted" sets by Paul Tol (2021), in an order that keeps neighbors distinct. Each further color
+# is the one that differs most from the colors before it in OKLab.
 OBJECT_COLORS = (
     "#4477aa", "#ee7733", "#44aa77", "#cc6677", "#66b8d9", "#ccaa33",
     "#8a63b0", "#997755", "#88aa44", "#cc77b8", "#336688", "#b0574f",
+    "#662266", "#226622", "#663322", "#77ddaa", "#dddd88", "#dd9999",
+    "#554499", "#993366", "#558822", "#9999dd", "#228877", "#2299dd",
+    "#775522", "#334466", "#ddaadd", "#99aa88", "#5599aa", "#993322",
 )  # fmt: skip
 
 
@@ -46,7 +51,7 @@ def rgb(color: str) -> Floats:
 def object_colors(count: int) -> Floats:
     """Return distinct colors for objects, with values from 0 to 1.
 
-    The first twelve colors come from `OBJECT_COLORS`. Further colors are spread over the hues by
+    The first colors come from `OBJECT_COLORS`. Further colors are spread over the hues by
     the golden angle, with three levels of lightness. The shape is (count, 3).
     """
     chosen = [to_rgb(color) for color in OBJECT_COLORS[:count]]

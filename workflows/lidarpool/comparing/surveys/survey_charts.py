@@ -188,7 +188,7 @@ def draw_histograms(
         limit = 1000 * max(1.6 * one["p95_abs_m"], _MIN_LIMIT_M)
         values = np.clip(1000 * components[name], -limit, limit)
         axes.hist(values, bins=np.linspace(-limit, limit, _BINS + 1).tolist(), color=_BAR_COLOR)
-        axes.axvline(1000 * one["mean_m"], color=theme.SENSOR, lw=1.2 * page.unit)
+        axes.axvline(1000 * one["mean_m"], color=theme.EMPHASIS, lw=1.2 * page.unit)
         for sign in (-1, 1):
             place = sign * 1000 * one["p95_abs_m"]
             axes.axvline(place, color=theme.MUTED, lw=0.9 * page.unit, ls=(0, (4, 3)))

@@ -123,6 +123,8 @@ def insert_picture(page: Path, name: str, svg: str) -> None:
 
 # A station in the top view: x and y in pixels from the northwest corner, and its number.
 _Mark = tuple[float, float, int]
+# Distance, in units of the font size, below which stations share a mark with all their numbers.
+_SAME_MARK = 0.8
 
 
 def _station_marks(result: RunResult, top_view: Squares) -> list[_Mark]:
@@ -181,15 +183,30 @@ def _shade_counts(counts: Floats | Ints) -> str:
 
 
 def _draw_marks(marks: Sequence[_Mark], letter: float) -> str:
-    """Draw stations as numbered discs, or as dots if there are many stations or only one."""
+    """Draw stations as numbered marks, or as dots if there are many stations or only one.
+
+    Stations at the same position, such as those at several heights, share a mark.
+    """
     if not 1 < len(marks) <= MAX_NUMBERED:
         radius = 0.25 * letter
         return "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y, _ in marks)
-    return "".join(
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{0.8 * letter:.2f}"/>'
-        f'<text x="{x:.1f}" y="{y + 0.34 * letter:.1f}">{number}</text>'
-        for x, y, number in marks
-    )
+    shared: dict[tuple[float, float], list[int]] = {}
+    for x, y, number in marks:
+        near = (at for at in shared if math.dist(at, (x, y)) < _SAME_MARK * letter)
+        shared.setdefault(next(near, (x, y)), []).append(number)
+    drawn = []
+    height = 1.6 * letter
+    for (x, y), numbers in shared.items():
+        label = ", ".join(map(str, numbers))
+        if len(numbers) > 1 and numbers[-1] - numbers[0] == len(numbers) - 1:
+            label = f"{numbers[0]}–{numbers[-1]}"
+        width = height + 0.62 * letter * max(len(label) - 2, 0)
+        drawn.append(
+            f'<rect x="{x - width / 2:.1f}" y="{y - height / 2:.1f}" width="{width:.2f}" '
+            f'height="{height:.2f}" rx="{height / 2:.2f}"/>'
+            f'<text x="{x:.1f}" y="{y + 0.34 * letter:.1f}">{label}</text>'
+        )
+    return "".join(drawn)
 
 
 def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> str:
