@@ -581,7 +581,9 @@ def test_the_node_outlives_a_simulator_that_is_killed_and_paused(folder, dds):
     try:
         assert node.stdout.readline().startswith("ready: /roof/points in ROS 2 domain")
         with dds.RosPublisher(dds.Network(domain=DOMAIN)) as publisher:
-            subscriber = dds.RosSubscriber(publisher, lambda topic, _: topic == "/roof/points")
+            subscriber = dds.RosSubscriber(
+                publisher, lambda topic, _: topic == "/roof/points", pytest.fail
+            )
 
             def wait_for(after_s: float, before_s: float) -> None:
                 """Wait for a cloud with a stamp within limits."""

@@ -205,12 +205,12 @@ def test_a_subscriber_reads_what_publishers_offer(dds):
         )
         writer = DataWriter(publisher._participant, topic, qos=qos)
         publisher.publish(simulators.transforms(3, [("a", "b", (1, 2, 3), 0)], "/tf_static"))
-        subscriber = dds.RosSubscriber(publisher, lambda topic, _: topic != "/tf")
+        subscriber = dds.RosSubscriber(publisher, lambda topic, _: topic != "/tf", pytest.fail)
         received: dict[str, RosMessage] = {}
         stop = time.monotonic() + 60
         while {*received} != {"/clock", "/tf_static"}:
             publisher.publish(simulators.transforms(3, [("a", "b", (1, 2, 3), 0)]))
-            writer.write(dds._serialized(writer.data_type, bytes(sent.cdr)))
+            writer.write(topic.data_type.deserialize(bytes(sent.cdr)))
             received |= {message.topic: message for message in subscriber.receive(0.05)}
             assert time.monotonic() < stop, received
         assert received["/clock"].kind == kind
@@ -224,7 +224,7 @@ def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
     from cyclonedds.topic import Topic
 
     with dds.RosPublisher(dds.Network(domain=DOMAIN + 5)) as publisher:
-        subscriber = dds.RosSubscriber(publisher, lambda *_: True)
+        subscriber = dds.RosSubscriber(publisher, lambda *_: True, pytest.fail)
         received: list[bytes] = []
 
         def publish_until_received(publish, time_s: float) -> None:
@@ -244,9 +244,7 @@ def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
         writer = DataWriter(publisher._participant, topic, qos=qos)
-        publish_until_received(
-            lambda sent: writer.write(dds._serialized(writer.data_type, bytes(sent.cdr))), 2
-        )
+        publish_until_received(lambda sent: writer.write(kind.deserialize(bytes(sent.cdr))), 2)
         received.clear()
         publish_until_received(publisher.publish, 3)  # until the new reader has been discovered
         received.clear()
@@ -256,6 +254,70 @@ def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
         last = [bytes(simulators.clock(4 + number).cdr) for number in range(5)]
         assert [cdr for cdr in received if cdr in last] == last
         assert subscriber.publishers("/clock") == 2
+
+
+def clock_classes(*, suffix: str = "_", name: str = "dds_.Clock_") -> tuple[Any, Any]:
+    """Return the classes Time and Clock, as a program without ROS may define them."""
+    from cyclonedds.idl import make_idl_struct, types
+
+    fields = {f"sec{suffix}": types.int32, f"nanosec{suffix}": types.uint32}
+    time_class = make_idl_struct("Time_", "builtin_interfaces.msg.dds_.Time_", fields)
+    typename = f"rosgraph_msgs.msg.{name}"
+    return time_class, make_idl_struct("Clock_", typename, {f"clock{suffix}": time_class})
+
+
+@pytest.mark.parametrize("change", ["no suffix", "appendable", "type name", "XCDR2"])
+def test_programs_whose_definitions_of_a_type_differ_are_connected(dds, change):
+    """As with ROS 2. What cannot be connected is stated."""
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.idl import annotations
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    time_class, kind = clock_classes(
+        suffix="" if change == "no suffix" else "_",
+        name="Clock" if change == "type name" else "dds_.Clock_",
+    )
+    if change in ("appendable", "XCDR2"):
+        annotations.appendable(time_class)
+        annotations.appendable(kind)
+    notes: list[str] = []
+    (clock_field,) = kind.__annotations__
+    is_stated = change in ("type name", "XCDR2")
+    with dds.RosPublisher(dds.Network(domain=DOMAIN + 6)) as publisher:
+        participant = DomainParticipant(DOMAIN + 6)
+        topic = Topic(participant, "rt/clock", kind)
+        reader = DataReader(participant, topic, qos=Qos(Policy.Reliability.Reliable(0)))
+        formats = Policy.DataRepresentation(
+            use_cdrv0_representation=change != "XCDR2", use_xcdrv2_representation=change == "XCDR2"
+        )
+        writer = DataWriter(participant, topic, qos=Qos(Policy.Reliability.Reliable(0), formats))
+        subscriber = dds.RosSubscriber(publisher, lambda *_: True, notes.append)
+        received: list[Any] = []
+        read: list[Any] = []
+        stop = time.monotonic() + 60
+        while not (notes if is_stated else received and read):
+            writer.write(kind(time_class(7, 8)))
+            publisher.publish(simulators.clock(9.5))
+            received += [m for m in subscriber.receive(0.02) if m.kind.endswith("Clock")]
+            read += [getattr(sample, clock_field) for sample in reader.take(9)]
+            assert time.monotonic() < stop
+    if is_stated:
+        difference = {
+            "type name": "with the type name rosgraph_msgs::msg::Clock instead of "
+            "rosgraph_msgs::msg::dds_::Clock_",
+            "XCDR2": "in the format XCDR2 instead of XCDR1",
+        }[change]
+        assert notes == [
+            f"A program publishes /clock {difference}, so its messages are not received."
+        ]
+    else:
+        assert notes == []
+        clocks = {bytes(message.cdr) for message in received}
+        assert bytes(simulators.clock(7.000000008).cdr) in clocks
+        assert time_class(9, 500_000_000) in read
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def follow(
     follow_options = FollowOptions(("world", "map", *world_frames), vanish_after_s)
     network = Network.for_hosts(to)
     with RosPublisher(network) as publisher:
-        connections = publisher, RosSubscriber(publisher, is_wanted)
+        connections = publisher, RosSubscriber(publisher, is_wanted, report)
         node = create_node(sources, connections, follow_options, report)
         with options.summary_at_end(lambda: node.summary):
             node.start()

@@ -13,20 +13,10 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import (
-    DDSException,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
+from cyclonedds.core import DDSException, InstanceState, ReadCondition, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
-from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
-from cyclonedds.sub import DataReader
-from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
@@ -35,6 +25,7 @@ from lidarsim.errors import LidarError
 from lidarsim.words import join_names, shorten_name
 
 from ..clouds.ros.messages import CLOCK_TOPIC, LATCHED_TOPICS, RosMessage, message_store
+from .serialized_topics import ANY_SAMPLE, SerializedReader, SerializedTopic, SerializedWriter
 
 LOOPBACK = "127.0.0.1"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
@@ -162,7 +153,7 @@ class RosPublisher:
     def __init__(self, network: Network) -> None:
         self.network = network
         self.dropped = 0  # messages that were dropped because a reader was too slow
-        self._writers: dict[str, Any] = {}
+        self._writers: dict[str, SerializedWriter] = {}
         try:
             self._domain = Domain(network.domain, network.configuration)
             self._participant = DomainParticipant(network.domain)
@@ -187,15 +178,14 @@ class RosPublisher:
         """Publish a message, creating its topic if necessary."""
         if message.topic not in self._writers:
             self._writers[message.topic] = self._writer(message.topic, message.kind)
-        writer = self._writers[message.topic]
         try:
-            writer.write(_serialized(writer.data_type, bytes(message.cdr)))
+            self._writers[message.topic].write_serialized(bytes(message.cdr))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise
             self.dropped += 1
 
-    def _writer(self, topic: str, kind: str) -> Any:
+    def _writer(self, topic: str, kind: str) -> SerializedWriter:
         """Create a writer for a topic.
 
         The writer is reliable, so that it matches reliable and best-effort readers.
@@ -209,29 +199,14 @@ class RosPublisher:
             Policy.History.KeepLast(depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
-        dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
-        return DataWriter(self._participant, dds_topic, qos=qos)
-
-
-class _SerializedMessage:
-    """A message that cyclonedds leaves serialized, because deserialization by rosbags is faster."""
-
-    sample_info: Any  # set by cyclonedds
-
-    def __init__(self, cdr: bytes) -> None:
-        self.cdr = cdr
-
-    @classmethod
-    def deserialize(cls, cdr: bytes, **_: Any) -> _SerializedMessage:
-        return cls(bytes(cdr))
-
-    deserialize_key = deserialize
+        dds_topic = SerializedTopic(self._participant, f"rt{topic}", message_class(kind))
+        return SerializedWriter(self._participant, dds_topic, qos)
 
 
 class _Reader(NamedTuple):
     """A reader of a topic, and the condition with which it ends waiting."""
 
-    data_reader: Any
+    data_reader: SerializedReader
     condition: ReadCondition
     is_reliable: bool
 
@@ -248,11 +223,19 @@ class RosSubscriber:
         Publisher whose connection to the network is used.
     is_wanted
         Function that returns whether messages are received, given a topic and a message type.
+    note
+        Function that shows a note about messages that are wanted, but cannot be received.
     """
 
-    def __init__(self, publisher: RosPublisher, is_wanted: Callable[[str, str], bool]) -> None:
+    def __init__(
+        self,
+        publisher: RosPublisher,
+        is_wanted: Callable[[str, str], bool],
+        note: Callable[[str], None],
+    ) -> None:
         self._participant = publisher._participant
         self._is_wanted = is_wanted
+        self._note = note
         self._discovery = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._wait_set = WaitSet(self._participant)
         self._attach(self._discovery)
@@ -276,14 +259,12 @@ class RosSubscriber:
         readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)
         for (topic, kind, _), reader in readers:
             # Not all samples are taken, because a flood of messages never ends.
-            for sample in reader.data_reader.take(_TAKEN):
-                if isinstance(sample, _SerializedMessage):
-                    time_ns = sample.sample_info.source_timestamp
-                    yield RosMessage(topic, kind, time_ns, sample.cdr)
+            for sample in reader.data_reader.take_serialized(_TAKEN):
+                yield RosMessage(topic, kind, sample.time_ns, sample.cdr)
 
     def _attach(self, reader: Any) -> ReadCondition:
         """Let messages of a reader end waiting."""
-        condition = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Any)
+        condition = ReadCondition(reader, ANY_SAMPLE)
         self._wait_set.attach(condition)
         return condition
 
@@ -297,8 +278,14 @@ class RosSubscriber:
             kind = endpoint.type_name.replace("::", "/").replace("/dds_/", "/").removesuffix("_")
             if endpoint.topic_name == topic or not self._is_wanted(topic, kind):
                 continue
-            self._writers[endpoint.key] = topic
             policies = [*endpoint.qos]
+            mismatch = _mismatch(endpoint.type_name, kind, policies)
+            if mismatch:
+                self._note(
+                    f"A program publishes {topic} {mismatch}, so its messages are not received."
+                )
+                continue
+            self._writers[endpoint.key] = topic
             is_reliable = any(isinstance(p, Policy.Reliability.Reliable) for p in policies)
             is_latched = Policy.Durability.TransientLocal in policies
             # A reader without reliability also receives the messages of reliable publishers. A
@@ -318,20 +305,20 @@ class RosSubscriber:
             Policy.History.KeepLast(_RECEIVED_DEPTH),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
-        dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
-        reader = DataReader(self._participant, dds_topic, qos=qos)
-        dds_topic.data_type = _SerializedMessage
+        dds_topic = SerializedTopic(self._participant, f"rt{topic}", message_class(kind))
+        reader = SerializedReader(self._participant, dds_topic, qos=qos)
         return _Reader(reader, self._attach(reader), is_reliable)
 
 
-def _serialized(kind: Any, cdr: bytes) -> Any:
-    """Create a message from its serialized form.
-
-    Serialization by cyclonedds would take 72 to 96 ms for a cloud of 2 MB.
-    """
-    message = object.__new__(kind)
-    message.serialize = lambda **_: cdr
-    return message
+def _mismatch(type_name: str, kind: str, policies: Sequence[Any]) -> str:
+    """Return in which way a publisher differs from those of ROS 2, or an empty string."""
+    expected = message_class(kind).__idl_typename__.replace(".", "::")
+    if type_name != expected:
+        return f"with the type name {type_name} instead of {expected}"
+    formats = [p for p in policies if isinstance(p, Policy.DataRepresentation)]
+    if formats and not formats[0].use_cdrv0_representation:
+        return "in the format XCDR2 instead of XCDR1"
+    return ""
 
 
 @cache
