@@ -140,11 +140,173 @@ def test_a_tilted_plane_has_the_distances_of_its_angle():
     assert components(below, "distance")["mean_m"] == pytest.approx(expected, rel=0.01)
 
 
-def test_points_of_a_wall_are_in_front_to_the_east():
-    rng = np.random.default_rng(7)
-    wall = np.column_stack([np.zeros(2000), rng.uniform(0, 10, (2000, 2))])
-    found = compare_surveys(cloud(wall + np.array([0.04, 0, 0])), cloud(wall), method="planes")
-    assert components(found, "distance")["mean_m"] == pytest.approx(0.04, abs=1e-6)
+def sheet(along, across, count=6000, *, seed, front=0.0, noise=0.0):
+    """Points of a rectangle between two vectors, shifted along its normal (along x across)."""
+    along, across = np.array(along, float), np.array(across, float)
+    rng = np.random.default_rng(seed)
+    shares = rng.uniform(0, 1, (count, 2))
+    normal = np.cross(along, across)
+    normal /= np.linalg.norm(normal)
+    offsets = front + rng.normal(0, noise, count)
+    return shares @ np.stack([along, across]) + offsets[:, None] * normal
+
+
+# Rectangles whose normals face the side on which distances are positive by default.
+SHEETS = {
+    "wall to the east": ((-3, 12, 0), (-0.1, 0, 4)),
+    "wall to the west": ((2, 9, 0), (0.1, 0, 4)),
+    "wall to the north": ((-9, 0, 0), (0, 0.1, 4)),
+    "overhanging wall": ((0, 12, 0), (0.1, 0, 4)),
+    "slope": ((12, 0, 5), (2, 9, 0)),
+    "ground": ((12, 0.1, 0), (0, 9, 0.1)),
+}
+METHODS = [
+    "planes",
+    pytest.param(
+        "m3c2",
+        marks=[
+            pytest.mark.extended,
+            pytest.mark.skipif(find_spec("py4dgeo") is None, reason="py4dgeo is not installed"),
+        ],
+    ),
+]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", SHEETS)
+@pytest.mark.parametrize("front", [0.02, -0.03])
+def test_distances_from_a_surface_have_one_sign(method, name, front):
+    a, b = (
+        sheet(*SHEETS[name], seed=seed, front=shift, noise=0.001)
+        for seed, shift in ((7, front), (8, 0))
+    )
+    found = compare_surveys(cloud(a + ORIGIN), cloud(b + ORIGIN), method=method, radius_m=0.6)
+    one = components(found, "distance")
+    assert one["mean_m"] == pytest.approx(front, abs=2e-4)
+    assert one["std_m"] < 0.0015
+    if method == "m3c2":  # both signs exceed the level of detection
+        level = found.figures["level_of_detection"]
+        assert level["significant"] > 0.95 * level["core_points"]
+
+
+def tube(radius, count=20_000, *, seed, height=0.0):
+    """Points of a tunnel that rises to the east."""
+    rng = np.random.default_rng(seed)
+    angles, x = rng.uniform(0, 2 * np.pi, count), rng.uniform(0, 30, count)
+    return np.column_stack([x, radius * np.cos(angles), height + radius * np.sin(angles) + 0.2 * x])
+
+
+def chamber(size, count=20_000, *, seed):
+    """Points of the six sides of a room whose center is at the origin."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    side = rng.integers(0, 6, count)
+    points[np.arange(count), side % 3] = side // 3 - 0.5
+    return points * size
+
+
+def mast(radius, count=8000, *, seed):
+    rng = np.random.default_rng(seed)
+    angles, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(0, 20, count)
+    return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), z])
+
+
+SOLIDS = {
+    # Rooms and tunnels face inward, so larger ones have negative distances.
+    "tunnel": (lambda grown, seed: tube(3 + grown, seed=seed), -1),
+    "room": (lambda grown, seed: chamber(np.array([9, 6, 4]) + 2 * grown, seed=seed), -1),
+    "mast": (lambda grown, seed: mast(2 + grown, seed=seed), 1),
+}
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("grown", [0.1, -0.1])
+def test_the_sides_of_a_solid_face_inward_or_outward_together(name, grown):
+    points, sign = SOLIDS[name]
+    a, b = cloud(points(grown, 9) + ORIGIN), cloud(points(0.0, 10) + ORIGIN)
+    found = compare_surveys(a, b, method="planes", radius_m=0.5)
+    one = components(found, "distance")
+    assert one["median_m"] == pytest.approx(sign * grown, abs=0.015)
+    distances = found.components["distance"]
+    assert np.mean(np.sign(distances) == np.sign(sign * grown)) > 0.995
+
+
+def write_ptx(path, *scans):
+    """Write scans, each a scanner position and points in world coordinates, with identical axes."""
+    with path.open("w") as file:
+        for position, points in scans:
+            axes = "1 0 0\n0 1 0\n0 0 1\n"
+            rows = "1 0 0 0\n0 1 0 0\n0 0 1 0\n" + " ".join(map(str, position)) + " 1\n"
+            file.write(f"{len(points)}\n1\n" + " ".join(map(str, position)) + "\n" + axes + rows)
+            np.savetxt(file, np.column_stack([points - position, np.ones(len(points))]), "%.5f")
+    return path
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scanned", ["a", "b"])
+@pytest.mark.parametrize("above", [True, False])
+def test_distances_are_positive_toward_the_scanner(tmp_path, method, scanned, above):
+    # A slab that is thinner than the radius, scanned from above or from below, which moved up.
+    station = np.array([2.0, -3.0, 4.0 if above else -4.0]) + ORIGIN
+    clouds = {
+        key: ORIGIN + sheet((12, 0, 1), (0, 9, 0), seed=seed, front=front, noise=0.001)
+        for key, seed, front in (("a", 3, 0.03), ("b", 4, 0.0))
+    }
+    sources = {key: cloud(points) for key, points in clouds.items()}
+    sources[scanned] = write_ptx(tmp_path / "scanned.ptx", (station, clouds[scanned]))
+    found = compare_surveys(sources["a"], sources["b"], method=method, radius_m=0.5)
+    one = components(found, "distance")
+    assert one["mean_m"] == pytest.approx(0.03 if above else -0.03, abs=2e-4)
+    assert one["std_m"] < 0.0015
+
+
+def test_both_sides_of_a_thin_wall_face_their_stations(tmp_path):
+    # The wall becomes thicker by 3 cm on the side of the first station, and thinner on the other.
+    stations = np.array([[8.0, 5, 2], [-9.0, 4, 1]]) + ORIGIN
+    sides = [
+        (sheet((0, 12, 0), (0, 0, 4), seed=11), (0.03, 0.0, 0.0)),
+        (sheet((0, 12, 0), (0, 0, 4), seed=12) - (0.15, 0, 0), (0.02, 0.0, 0.0)),
+    ]
+    files = [
+        write_ptx(
+            tmp_path / f"{number}.ptx",
+            *(
+                (station, points + ORIGIN + number * np.array(moved))
+                for station, (points, moved) in zip(stations, sides, strict=True)
+            ),
+        )
+        for number in (1, 0)
+    ]
+    found = compare_surveys(*files, method="planes", radius_m=0.12, max_distance_m=0.06)
+    east = found.points[:, 0] > ORIGIN[0] - 0.07
+    distances = found.components["distance"]
+    assert np.allclose(distances[east], 0.03, atol=1e-4)
+    assert np.allclose(distances[~east], -0.02, atol=1e-4)
+    assert 0.4 < east.mean() < 0.6
+
+
+def swept(points, scans, poses):
+    """A result whose sensor has one sweep at each pose, with ten scans each."""
+    survey = Survey(Sensor.grid(360, 4), poses=poses, steps=10)
+    sweeps = replace(Sweeps.from_survey(survey, Scene.seed()), coordinates="world")
+    columns = {"scan": scans, "channel": 0 * scans, "object": 0 * scans}
+    return Cloud(points, columns, sweeps=lambda: sweeps)
+
+
+@pytest.mark.parametrize("moved", [0.04, -0.04])
+def test_distances_are_positive_toward_the_poses_of_sweeps(moved):
+    # Sweep 0 is above the slab, and sweep 1 is below it. Each of them sees one half.
+    scans = np.repeat([3, 14], 3000)
+    halves = [sheet((6, 0, 0), (0, 9, 0.5), 3000, seed=seed) for seed in (1, 2)]
+    points = np.concatenate([halves[0] - (6.5, 0, 0), halves[1] + (0.5, 0, 0)])
+    poses = [(-4.0, 3.0, 2.0), (4.0, 5.0, -3.0)]
+    b = swept(points, scans, poses)
+    found = compare_surveys(
+        cloud(points + np.array([0, 0, moved])), b, method="planes", radius_m=0.5
+    )
+    expected = moved * np.cos(np.arctan2(0.5, 9)) * np.where(found.points[:, 0] < 0, 1, -1)
+    assert len(expected) > 5900
+    assert np.allclose(found.components["distance"], expected, atol=1e-6)
 
 
 def test_points_without_a_counterpart_are_counted():

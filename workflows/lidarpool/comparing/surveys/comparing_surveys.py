@@ -227,13 +227,14 @@ def _distances(
     points, notes_a = a.sample(max_points if method == "m3c2" else min(max_points, _MAX_COMPARED))
     reference, notes_b = b.sample(max_points)
     reach_m = max_distance_m or MAX_DISTANCE_M
-    check_overlap(points, reference, (a.name, b.name), reach_m)
+    check_overlap(points.positions, reference.positions, (a.name, b.name), reach_m)
     if radius_m is None:
-        radius_m = neighborhood_radius(reference)
+        radius_m = neighborhood_radius(reference.positions)
     compute = m3c2_deviations if method == "m3c2" else plane_deviations
     found = compute(points, reference, radius_m, reach_m)
-    counts = {"points": {"a": len(points), "b": len(reference)}}
-    found.figures.update(counts)
+    found.figures["points"] = {"a": len(points), "b": len(reference)}
+    has_scanners = points.has_scanners or reference.has_scanners
+    found.figures["positive_side"] = "scanners" if has_scanners else "surfaces"
     return found, notes_a + notes_b
 
 
@@ -242,7 +243,7 @@ def _compare_with_mesh(
 ) -> SurveyComparison:
     points, notes = a.sample(_MAX_COMPARED)
     chosen = {name: value for name, value in options.items() if value is not None}
-    found = mesh_deviations(points, mesh, reach_m, **chosen)
+    found = mesh_deviations(points.positions, mesh, reach_m, **chosen)
     found.figures["points"] = {"a": len(points)}
     return _summarize("mesh", [a], found, notes, str(mesh))
 

@@ -8,27 +8,29 @@ import numpy as np
 
 from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Floats
 
 from .deviations import Deviations
+from .orientation import OrientedPoints, nearby_scanners, thin_out
+from .survey_clouds import SurveyPoints
 
 _MAX_CORE_POINTS = 500_000
 
 
 def m3c2_deviations(
-    points: Floats, reference: Floats, radius_m: float, max_distance_m: float
+    points: SurveyPoints, reference: SurveyPoints, radius_m: float, max_distance_m: float
 ) -> Deviations:
     """Return M3C2 distances of A from B at core points, with their level of detection.
 
     There is one core point in each cubic cell of `radius_m` that contains points of B. Normals are
-    computed from the points of B within `radius_m`, and point up. Points of A and B within a
-    cylinder of this radius, up to `max_distance_m` along the normal in both directions, are
-    averaged.
+    computed from the points of B within `radius_m`. They point to the scanner or, if its position
+    is unknown, to the side that `OrientedPoints` selects for the whole surface. Points of A and B
+    within a cylinder of this radius, up to `max_distance_m` along the normal in both directions,
+    are averaged.
 
     Parameters
     ----------
     points, reference
-        Points of A and B in world coordinates. Shapes (n, 3) and (m, 3).
+        Points of A and B.
     radius_m
         Radius of the neighborhoods and of the cylinders.
     max_distance_m
@@ -38,17 +40,17 @@ def m3c2_deviations(
     import py4dgeo
 
     logging.getLogger("py4dgeo").setLevel(logging.WARNING)
-    origin = np.floor(reference.mean(axis=0))
-    cells = np.floor((reference - origin) / radius_m).astype(np.int64)
-    _, rows = np.unique(cells, axis=0, return_index=True)
+    origin = np.floor(reference.positions.mean(axis=0))
+    points, reference = points.relative_to(origin), reference.relative_to(origin)
+    rows = thin_out(reference.positions, radius_m)
     if len(rows) > _MAX_CORE_POINTS:
         raise LidarError(
             f"A radius of {radius_m:g} m results in {len(rows):,} core points; the limit is "
             f"{_MAX_CORE_POINTS:,}. Increase `--radius`."
         )
-    core_points = np.ascontiguousarray(reference[np.sort(rows)] - origin)
+    core_points = reference.positions[rows]
     epochs = tuple(
-        py4dgeo.Epoch(np.ascontiguousarray(cloud - origin)) for cloud in (reference, points)
+        py4dgeo.Epoch(np.ascontiguousarray(cloud.positions)) for cloud in (reference, points)
     )
     algorithm = py4dgeo.M3C2(
         epochs=epochs,
@@ -57,6 +59,12 @@ def m3c2_deviations(
         cyl_radius=radius_m,
         max_distance=max_distance_m,
     )
+    algorithm.corepoint_normals = OrientedPoints.from_normals(
+        core_points,
+        np.asarray(algorithm.directions()),
+        nearby_scanners(reference, rows, points),
+        radius_m,
+    ).normals
     distances, uncertainties = algorithm.run()
     detection = np.asarray(uncertainties["lodetection"], np.float64)
     found = np.isfinite(distances)

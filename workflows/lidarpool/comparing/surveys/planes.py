@@ -7,18 +7,20 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Bools, Floats
+from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
 
 from ...open3d_access.neighbors import NeighborSearch
 from .deviations import Deviations
+from .orientation import OrientedPoints, nearby_scanners, thin_out
+from .survey_clouds import SurveyPoints
 
 _BATCH = 100_000  # points per batch, which limits the memory for their neighbors
 _NEIGHBORS = 24  # maximum number of points that determine a plane
 _MIN_NEIGHBORS = 6
 _MIN_WIDTH = 0.2  # minimum width of a neighborhood relative to its length, to exclude lines
 _SAMPLES = 2000
-_LEVEL = 0.05  # normals with a smaller vertical component are horizontal (3 degrees)
+_MAX_ORIENTED = 200_000  # points at which the orientation of surfaces is determined
 
 
 class _Planes(NamedTuple):
@@ -26,6 +28,11 @@ class _Planes(NamedTuple):
     normals: Floats  # (n, 3)
     rms_m: Floats  # (n,): root mean square distance of the neighbors from the plane
     are_valid: Bools  # (n,)
+
+    def select(self, rows: Bools) -> _Planes:
+        return _Planes(
+            self.centers[rows], self.normals[rows], self.rms_m[rows], self.are_valid[rows]
+        )
 
 
 def neighborhood_radius(points: Floats) -> float:
@@ -44,37 +51,35 @@ def neighborhood_radius(points: Floats) -> float:
 
 
 def plane_deviations(
-    points: Floats, reference: Floats, radius_m: float, max_distance_m: float
+    points: SurveyPoints, reference: SurveyPoints, radius_m: float, max_distance_m: float
 ) -> Deviations:
     """Return the signed distances from points to planes through the reference.
 
     The plane for a point is fitted to the neighbors of the nearest reference point within
-    `radius_m`, at most 24. Distances are positive above the plane. Vertical planes face east, or
-    north if they are parallel to the east axis.
+    `radius_m`, at most 24. Distances are positive on the side of the scanner or, if its position is
+    unknown, on the side that `OrientedPoints` selects for the whole surface.
 
     Parameters
     ----------
     points, reference
-        Points of A and B in world coordinates. Shapes (n, 3) and (m, 3).
+        Points of A and B.
     radius_m
         Maximum radius of the neighborhoods.
     max_distance_m
         Points farther than this from the reference have no counterpart.
     """
-    search = NeighborSearch(reference, radius_m)
-    origin = reference.mean(axis=0)
+    origin = reference.positions.mean(axis=0)
+    points = points.relative_to(origin)
+    planes = _ReferencePlanes(reference.relative_to(origin), points, radius_m)
     distances, roughness = np.full((2, len(points)), np.nan)
     too_far = 0
     for start in range(0, len(points), _BATCH):
-        batch = points[start : start + _BATCH]
-        separation, nearest = search.nearest(batch)
+        rows = np.arange(start, min(start + _BATCH, len(points)))
+        separation, nearest = planes.search.nearest(points.positions[rows])
         is_near = separation[:, 0] <= max_distance_m
         too_far += int(np.count_nonzero(~is_near))
-        planes = _fit_planes(search, reference, nearest[is_near, 0], origin)
-        signed = np.einsum("ni,ni->n", batch[is_near] - origin - planes.centers, planes.normals)
-        rows = start + np.flatnonzero(is_near)[planes.are_valid]
-        distances[rows] = signed[planes.are_valid]
-        roughness[rows] = planes.rms_m[planes.are_valid]
+        rows = rows[is_near]
+        distances[rows], roughness[rows] = planes.distances(rows, nearest[is_near, 0])
     found = np.isfinite(distances)
     if not found.any():
         raise LidarError(
@@ -88,33 +93,69 @@ def plane_deviations(
         "without_counterpart": too_far,
         "without_plane": int(len(points) - found.sum() - too_far),
     }
-    return Deviations(points[found], {"distance": distances[found]}, figures)
+    return Deviations(points.positions[found] + origin, {"distance": distances[found]}, figures)
 
 
-def _fit_planes(search: NeighborSearch, reference: Floats, rows: Floats, origin: Floats) -> _Planes:
-    """Fit planes to the neighborhoods of reference points, relative to an origin."""
+class _ReferencePlanes:
+    """Oriented planes through the neighborhoods of reference points."""
+
+    def __init__(self, reference: SurveyPoints, points: SurveyPoints, radius_m: float) -> None:
+        self.search = NeighborSearch(reference.positions, radius_m)
+        self._reference = reference
+        self._points = points
+        self._surfaces = self._orient_surfaces(radius_m)
+
+    def _orient_surfaces(self, spacing_m: float) -> OrientedPoints:
+        """Orient the normals at evenly distributed reference points."""
+        rows = thin_out(self._reference.positions, spacing_m)
+        while len(rows) > _MAX_ORIENTED:
+            spacing_m *= 1.1 * np.sqrt(len(rows) / _MAX_ORIENTED)
+            rows = thin_out(self._reference.positions, spacing_m)
+        planes = self._fit(rows)
+        if planes.are_valid.any():
+            rows, planes = rows[planes.are_valid], planes.select(planes.are_valid)
+        scanners = nearby_scanners(self._reference, rows, self._points)
+        return OrientedPoints.from_normals(planes.centers, planes.normals, scanners, spacing_m)
+
+    def _fit(self, rows: Indices) -> _Planes:
+        return _fit_planes(self.search, self._reference.positions, rows)
+
+    def distances(self, rows: Indices, nearest: Indices) -> tuple[Floats, Floats]:
+        """Return signed distances of points of A, and the RMS distances of the planes' own points.
+
+        Both are NaN if the nearest reference point has no plane.
+
+        Parameters
+        ----------
+        rows
+            Rows of the points of A.
+        nearest
+            Rows of the reference points that are nearest to them.
+        """
+        distances, rms_m = np.full((2, len(rows)), np.nan)
+        planes = self._fit(nearest)
+        valid = planes.are_valid
+        if valid.any():
+            planes = planes.select(valid)
+            scanners = self._points.scanner_positions(rows[valid])
+            if self._reference.has_scanners:
+                scanners = self._reference.scanner_positions(nearest[valid])
+            normals = self._surfaces.orient(planes.centers, planes.normals, scanners)
+            offsets = self._points.positions[rows[valid]] - planes.centers
+            distances[valid] = np.einsum("ni,ni->n", offsets, normals)
+            rms_m[valid] = planes.rms_m
+        return distances, rms_m
+
+
+def _fit_planes(search: NeighborSearch, reference: Floats, rows: Indices) -> _Planes:
+    """Fit planes to the neighborhoods of reference points. Their normals are not oriented."""
     index, counts = search.within(reference[rows], _NEIGHBORS)
     is_neighbor = np.arange(_NEIGHBORS) < counts[:, None]
-    neighbors = reference[np.where(is_neighbor, index, 0)] - origin
+    neighbors = reference[np.where(is_neighbor, index, 0)]
     weights = is_neighbor[..., None]
     centers = (neighbors * weights).sum(axis=1) / np.maximum(counts, 1)[:, None]
     offsets = (neighbors - centers[:, None]) * weights
     squares, axes = np.linalg.eigh(offsets.swapaxes(1, 2) @ offsets)
     are_valid = (counts >= _MIN_NEIGHBORS) & (squares[:, 1] >= _MIN_WIDTH**2 * squares[:, 2])
     rms_m = np.sqrt(np.maximum(squares[:, 0], 0) / np.maximum(counts, 1))
-    return _Planes(centers, orient_normals(axes[:, :, 0]), rms_m, are_valid)
-
-
-def orient_normals(normals: Floats) -> Floats:
-    """Orient normals so that they point up or, if they are horizontal, east or north.
-
-    The shape is (n, 3).
-
-    Examples
-    --------
-    >>> orient_normals(np.array([[0.6, 0, -0.8], [-1, 0, 0.01]])).tolist()
-    [[-0.6, -0.0, 0.8], [1.0, -0.0, -0.01]]
-    """
-    x, y, z = normals.T
-    decisive = np.where(np.abs(z) > _LEVEL, z, np.where(np.abs(x) > _LEVEL, x, y))
-    return np.where(decisive < 0, -1.0, 1.0)[:, None] * normals
+    return _Planes(centers, axes[:, :, 0], rms_m, are_valid)

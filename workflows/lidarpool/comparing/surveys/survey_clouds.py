@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.vocabulary import UNITS_M
 
@@ -22,8 +22,40 @@ from ...recordings.opening import open_recording
 from ..compared_sweep import check_reach
 
 CloudSource = str | Path | Cloud | StoredCloud
+UNKNOWN = -1  # index of an unknown scanner
 SENSOR = "sensor_number"  # column that contains the index of the sensor
 _MILLIONTH = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyPoints:
+    """Points in world coordinates, with the positions from which they were measured."""
+
+    positions: Floats  # (n, 3), meters
+    scanners: Floats  # (k, 3): positions of scan stations, or of the sensor at the start of sweeps
+    scanner: Ints  # (n,): index of the scanner that measured each point, or `UNKNOWN`
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @property
+    def has_scanners(self) -> bool:
+        """Whether the scanner position of at least one point is known."""
+        return bool(len(self.scanners))
+
+    def relative_to(self, origin: Floats) -> SurveyPoints:
+        """Return the points in coordinates relative to an origin, of shape (3,)."""
+        return SurveyPoints(self.positions - origin, self.scanners - origin, self.scanner)
+
+    def scanner_positions(self, rows: Ints | slice = slice(None)) -> Floats | None:
+        """Return the scanner positions of some points, of shape (n, 3).
+
+        Unknown positions are NaN. Returns None if all of them are unknown.
+        """
+        if not self.has_scanners:
+            return None
+        scanner = self.scanner[rows]
+        return np.where((scanner == UNKNOWN)[:, None], np.nan, self.scanners[scanner])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +143,22 @@ class SurveyCloud:
                     sensor = np.full(len(part), number, np.int64)
                     yield part.replace(columns={**part.columns, SENSOR: sensor})
 
-    def sample(self, max_points: int) -> tuple[Floats, list[str]]:
+    def sample(self, max_points: int) -> tuple[SurveyPoints, list[str]]:
         """Read points, sampled evenly if there are more than about `max_points`.
 
         Returns
         -------
-        The points in world coordinates, with shape (n, 3), and notes for the user.
+        The points in world coordinates, and notes for the user.
         """
         count = self.point_count
         share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         chosen: list[Floats] = []
+        scanners: list[Floats | None] = []
         kept = 0
         for part in self.parts():
             rows = even_indices(len(part), round(share * len(part)))
             chosen.append(part.points if share == 1 else part.points[rows])
+            scanners.append(part.scanner)
             kept += len(chosen[-1])
             if kept > 1.5 * max_points:  # the number of points was unknown
                 chosen = [points[::2] for points in chosen]
@@ -136,24 +170,38 @@ class SurveyCloud:
                 f"{self.name} contains no points, so there is nothing to compare.{omitted}"
             )
         note = f"{100 * share:.3g} % of the points in {self.name} are used, sampled evenly"
-        return np.concatenate(chosen), [] if share == 1 else [note]
+        known = np.array([scanner is not None for scanner in scanners])
+        index = np.where(known, np.cumsum(known) - 1, UNKNOWN).astype(np.int32)
+        points = SurveyPoints(
+            np.concatenate(chosen),
+            np.array([scanner for scanner in scanners if scanner is not None]).reshape(-1, 3),
+            np.repeat(index, [len(points) for points in chosen]),
+        )
+        return points, [] if share == 1 else [note]
 
 
 def _world_points(recording: Recording, number: int) -> Sweep:
+    """Return the returns of a sweep in world coordinates, with the position of its scanner."""
     sweep = recording[number].returns()
     check_reach(recording, sweep)
+    scanner = sweep.scanner
+    if scanner is not None:
+        scanner = np.asarray(scanner, np.float64) * recording.meters
     if recording.is_cloud:
-        return sweep
+        return sweep.replace(scanner=scanner)
     if sweep.pose is None:
         raise LidarError(
             f"{recording.name} is in sensor coordinates and does not contain the pose of the "
             "sensor, so its points cannot be compared in world coordinates."
         )
+    # Files of scans without a pose are read with an identity matrix.
+    if scanner is None and (recording.read_poses or not np.array_equal(sweep.pose, np.eye(4))):
+        scanner = sweep.pose[:3, 3]
     columns = sweep.columns
     if "range" not in columns:
         fired = sweep if recording.fired is None else recording.read_fired(number)
         columns = {**columns, "range": np.linalg.norm(fired.points, axis=1)}
-    return sweep.replace(points=sweep.in_world(), columns=columns)
+    return sweep.replace(points=sweep.in_world(), columns=columns, scanner=scanner)
 
 
 def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
