@@ -290,13 +290,14 @@ class PartProcess:
         return self._augmenters[variant]
 
     def notes(self) -> tuple[str, ...]:
-        """Return the notes of the resampler and of all augmenters."""
+        """Return the notes of the recording, the resampler and all augmenters."""
         notes = [note for augmenter in self._augmenters.values() for note in augmenter.notes]
         if self.resampler is not None:
             notes = [*self.resampler.notes, *notes]
         if len(self.plan.files) > 1:
             notes = [f"{self.file.sensor}: {note}" for note in notes]
-        return tuple(dict.fromkeys(notes))
+        recorded = [f"{note}." for note in self.recording.notes]
+        return tuple(dict.fromkeys([*recorded, *notes]))
 
     def augmented(self, number: int, variant: int) -> AugmentedSweep:
         """Return an augmented sweep, whose templates are rows of the recorded sweep."""

@@ -266,7 +266,7 @@ class _Comparing:
     protocol: str | None
 
     def __post_init__(self) -> None:
-        self.notes = [note for recording in self.recordings for note in recording.notes]
+        self.notes: list[str] = []  # in addition to those of the recordings
         self.pairs: list[tuple[int, int]] = []  # indices of sweeps; empty for whole clouds
         self.point_counts = np.zeros(2, np.int64)
         self.images: RangeImages | None = None  # images of the first pair that has them
@@ -467,10 +467,7 @@ class _Comparing:
             **self._source_figures(),
             "pairs": len(self.pairs),
             "pictured": self.pictured and [*self.pictured],
-            "notes": self.notes
-            + self._empty_notes()
-            + self._image_notes()
-            + [note for r in self.recordings for note in r.omission_notes],
+            "notes": self._all_notes(),
             "ranges": range_figures,
             "intensity": self._intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),
@@ -525,6 +522,13 @@ class _Comparing:
             "chamfer_m": float(to_b.mean() + to_a.mean()),
             "f_scores": f_scores,
         }
+
+    def _all_notes(self) -> list[str]:
+        """Return all notes. Recordings add notes when their poses and points are read."""
+        recorded = [note for recording in self.recordings for note in recording.notes]
+        omitted = [note for recording in self.recordings for note in recording.omission_notes]
+        notes = [*recorded, *self.notes, *self._empty_notes(), *self._image_notes(), *omitted]
+        return list(dict.fromkeys(notes))
 
     def _empty_notes(self) -> list[str]:
         if not self.empty_pairs:

@@ -121,13 +121,14 @@ def recorded_view(
         If a recording is damaged or has no points.
     """
     first = next(iter(sensors.values()))
-    notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
+    further_notes: list[str] = []
     if first.is_cloud:
         cloud = _read_cloud(first, on_part)
         sweeps = None
     else:
         cloud, sweeps, further_notes = _read_sweeps(sensors)
-        notes += further_notes
+    notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
+    notes += further_notes
     notes += [note for recording in sensors.values() for note in recording.omission_notes]
     if not len(cloud):
         left_out = "".join(f" {note}." for note in first.omission_notes)

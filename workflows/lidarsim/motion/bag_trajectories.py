@@ -16,7 +16,7 @@ from ..numerics.vectors import matmul, matvec
 from ..words import did_you_mean, join_names, plural
 from .navigation import from_geodetic
 from .rotations import quaternions_of
-from .trajectory import Track
+from .trajectory import QUATERNION_SLACK, Track
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -33,6 +33,7 @@ _GNSS = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
+_MAX_LISTED = 3  # maximum number of times in a message
 _MAX_DIFFERENCE = 1e-6  # maximum difference between two copies of a pose that was sent twice
 _READABLE_TYPES = ", ".join([*_POSES, _GNSS, _FRAMES])
 
@@ -48,11 +49,15 @@ class TimedPoses(NamedTuple):
         Positions in meters. Shape (k, 3).
     quaternions
         Quaternions (x, y, z, w), or None if the bag has no orientations. Shape (k, 4).
+    skipped
+        Description of invalid transforms that were skipped, as the end of a sentence about the bag.
+        Empty if there are none.
     """
 
     seconds: Floats
     positions: Floats
     quaternions: Floats | None
+    skipped: str = ""
 
 
 @dataclass
@@ -62,6 +67,26 @@ class _Edge:
     parent: str
     times_ns: list[int] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)  # x, y, z and the quaternion
+    invalid_ns: list[int] = field(default_factory=list)  # times of invalid transforms
+
+    def add(self, time_ns: int, row: list[float]) -> None:
+        """Add a pose. Invalid poses are skipped, as in tf2."""
+        length = float(np.linalg.norm(row[3:]))
+        if np.isfinite(row).all() and abs(length - 1) <= QUATERNION_SLACK:
+            self.times_ns.append(time_ns)
+            self.rows.append(row)
+        else:
+            self.invalid_ns.append(time_ns)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether there are several poses that differ."""
+        return self.is_repeated and any(row != self.rows[0] for row in self.rows)
+
+    @property
+    def is_repeated(self) -> bool:
+        """Whether there are poses at several times."""
+        return len(set(self.times_ns)) > 1
 
 
 def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
@@ -85,7 +110,7 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         If the bag cannot be read, or if the topic does not exist or is ambiguous.
     """
     with opened_bag(path, "the bag") as bag:
-        message_types = {connection.topic: connection.msgtype for connection in bag.connections}
+        message_types = _message_types(bag)
         base_topic, _, frame = (topic or "").partition(":")
         base_topic, _, imu = base_topic.partition(" ")
         pose_topics = [
@@ -104,6 +129,25 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         if message_types[chosen] == _GNSS:
             return _gnss_poses(bag, message_types, chosen, imu, origin)
         return _topic_poses(bag, chosen, _POSES[message_types[chosen]])
+
+
+def read_frame(path: Path, frame: str) -> TimedPoses | None:
+    """Read the poses of a frame in a ROS 2 bag from its tf topics.
+
+    Returns None if the bag does not contain the frame, or if neither the frame nor one of its
+    ancestors moves. Raises LidarError if the bag cannot be read, or if its frames are inconsistent.
+    """
+    with opened_bag(path, "the bag") as bag:
+        edges = _edges_of(bag, _message_types(bag))
+    chain = _chain(edges, frame)
+    if not any(edge.is_repeated or edge.invalid_ns for edge in chain):
+        return None
+    return _frame_poses(edges, frame)
+
+
+def _message_types(bag: Reader) -> dict[str, str]:
+    """Return the message type of each topic."""
+    return {connection.topic: connection.msgtype for connection in bag.connections}
 
 
 def _choose_label(labels: Sequence[str], topic: str | None) -> str:
@@ -257,8 +301,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
             if topic.endswith(_STATIC):
                 edge.times_ns.clear()
                 edge.rows.clear()
-            edge.times_ns.append(_stamp_ns(stamped.header))
-            edge.rows.append(_row_of(stamped.transform))
+            edge.add(_stamp_ns(stamped.header), _row_of(stamped.transform))
     return edges
 
 
@@ -280,11 +323,8 @@ def _moving_frames(edges: Mapping[str, _Edge]) -> list[str]:
 
     If no frame moves, return the frames with several poses.
     """
-    repeated = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
-    changing = [
-        frame for frame in repeated if any(row != edges[frame].rows[0] for row in edges[frame].rows)
-    ]
-    return changing or repeated
+    repeated = [frame for frame, edge in edges.items() if edge.is_repeated]
+    return [frame for frame in repeated if edges[frame].is_moving] or repeated
 
 
 def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
@@ -294,6 +334,9 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     which all its moving ancestors have poses.
     """
     chain = _chain(edges, frame)
+    skipped = _skipped_transforms(chain)
+    if not all(edge.rows for edge in chain):
+        raise LidarError(f"no transform of its frame {frame!r} can be used. It {skipped}.")
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
     moving = [times for times, _ in tables if len(times) > 1]
     if not moving:
@@ -311,7 +354,21 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
         edge_positions, edge_rotations = _edge_poses(edge_times, rows, times)
         positions = edge_positions + matvec(edge_rotations, positions)
         rotations = matmul(edge_rotations, rotations)
-    return TimedPoses(times / 1e9, positions, quaternions_of(rotations))
+    return TimedPoses(times / 1e9, positions, quaternions_of(rotations), skipped)
+
+
+def _skipped_transforms(chain: Sequence[_Edge]) -> str:
+    """Describe the invalid transforms in a chain, or return an empty string if there are none."""
+    times_ns = sorted(time for edge in chain for time in edge.invalid_ns)
+    if not times_ns:
+        return ""
+    listed = ", ".join(f"{time // 10**9}.{time % 10**9:09}" for time in times_ns[:_MAX_LISTED])
+    others = len(times_ns) - _MAX_LISTED
+    more = f" and {others:,} more" if others > 0 else ""
+    return (
+        "has invalid transforms on its tf topics, which contain NaN or a quaternion whose length "
+        f"is not 1. Their times are {listed}{more} (seconds)"
+    )
 
 
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:

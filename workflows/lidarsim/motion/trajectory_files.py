@@ -232,8 +232,11 @@ def _read_container(
     if is_bag(path) and kind in (None, "bag"):
         if timing.file is not None:
             raise ValueError("a bag contains its own times. Remove `times`")
-        poses = PoseTable(*read_bag(path, topic, origin))
-        return "bag", poses._replace(seconds=seconds_of(poses.seconds, timing.unit))
+        found = read_bag(path, topic, origin)
+        if found.skipped:
+            raise ValueError(f"the bag {found.skipped}. Remove them from the bag")
+        seconds = seconds_of(found.seconds, timing.unit)
+        return "bag", PoseTable(seconds, found.positions, found.quaternions)
     _refuse_topic(topic)
     folder = find_oxts(path)
     if folder is not None and kind in (None, "oxts"):

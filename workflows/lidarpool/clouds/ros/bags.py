@@ -29,7 +29,7 @@ from lidarsim.columns.table import COLORS, SURFACE_COLUMNS
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input_text
-from lidarsim.motion.bag_trajectories import read_bag
+from lidarsim.motion.bag_trajectories import read_frame
 from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
@@ -336,10 +336,14 @@ def _open_bag(source: RecordingSource) -> Recording:
     def read_stamps() -> Iterator[float]:
         return (float(header.stamp_ns) for header in headers())
 
-    def read_poses() -> Floats | None:
-        return _sweep_poses(source.path, [*headers()])
-
     unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
+    notes = [*source.prefix_notes(unstamped)]
+
+    def read_poses() -> Floats | None:
+        poses, clauses = _sweep_poses(source.path, [*headers()])
+        notes.extend(note for note in source.prefix_notes(clauses) if note not in notes)
+        return poses
+
     return source.stream(
         messages,
         convert,
@@ -348,7 +352,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         read_poses=read_poses,
         read_classes=lambda: _class_names(bags()),
         read_boxes=lambda: _boxes(bags(), [*headers()], read_poses()),
-        notes=source.prefix_notes(unstamped),
+        notes=notes,
         compensated=_stated_compensation(source.path),
     )
 
@@ -427,8 +431,10 @@ def header_of(data: bytes) -> MessageHeader:
     return MessageHeader(seconds * 10**9 + nanoseconds, frame)
 
 
-def _sweep_poses(path: Path, headers: Sequence[MessageHeader]) -> Floats | None:
-    """Return the poses of sweeps relative to the root of the frame tree.
+def _sweep_poses(
+    path: Path, headers: Sequence[MessageHeader]
+) -> tuple[Floats | None, tuple[str, ...]]:
+    """Return the poses of sweeps relative to the root of the frame tree, and notes about them.
 
     Parameters
     ----------
@@ -440,21 +446,28 @@ def _sweep_poses(path: Path, headers: Sequence[MessageHeader]) -> Floats | None:
     Returns
     -------
     Matrices of shape (n, 4, 4), or None if the bag does not contain poses for the times of all
-    sweeps.
+    sweeps. The notes are clauses that follow the name of the bag.
     """
     frames = {header.frame.lstrip("/") for header in headers}
     if len(frames) != 1:
-        return None
+        return None, ()
     try:
-        seconds, positions, quaternions = read_bag(path, f"/tf:{frames.pop()}", None)
-    except LidarError:  # the frame does not exist or does not move
-        return None
+        found = read_frame(path, frames.pop())
+    except LidarError as error:
+        return None, (f"has no usable poses: {str(error).removesuffix('.')}",)
+    if found is None:
+        return None, ()
+    seconds, positions, quaternions, skipped = found
+    clauses = (f"{skipped}. They are skipped",) if skipped else ()
     times_ns = 1e9 * (seconds - seconds[0])
     stamps_ns = np.array([header.stamp_ns for header in headers]) - 1e9 * seconds[0]
     within_ns = stamps_ns.clip(times_ns[0], times_ns[-1])
-    if np.abs(stamps_ns - within_ns).max() > _MAX_DISTANCE_NS:
-        return None
+    beyond = np.flatnonzero(np.abs(stamps_ns - within_ns) > _MAX_DISTANCE_NS)
+    if len(beyond):
+        limit_s = _MAX_DISTANCE_NS / 1e9
+        clause = f"has no pose within {limit_s:g} s of sweep {beyond[0]}, so its poses are not used"
+        return None, (*clauses, clause)
     track = Track(seconds - seconds[0], positions, quaternions)
     poses = np.tile(np.eye(4), (len(headers), 1, 1))
     poses[:, :3, 3], poses[:, :3, :3] = track.poses(0, within_ns)
-    return poses
+    return poses, clauses
