@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import multiprocessing
+import re
 import sys
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +16,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from lidarpool import LidarError, compare, twin
+from lidarpool import LidarError, compare, load_trajectory, twin
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
@@ -139,6 +141,31 @@ def test_files_that_are_not_numbered_have_a_row_each(tmp_path):
         open_recording(folder)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("element", [(1, 3), (1, 5)])  # a translation and a rotation
+def test_poses_that_are_not_finite_are_refused(tmp_path, value, element):
+    kitti(tmp_path, range(3), 3)
+    rows = np.loadtxt(tmp_path / "poses.txt")
+    rows[element] = value
+    np.savetxt(tmp_path / "poses.txt", rows)
+    recording = open_recording(tmp_path)
+    assert recording[0].pose[0, 3] == 0 and recording[2].pose[0, 3] == 2
+    for read in (lambda: recording[1], lambda: recording.poses([0, 1])):
+        with pytest.raises(LidarError, match="the pose of sweep 1 is not finite"):
+            read()
+    recording = replace(recording, read_poses=lambda: np.full((3, 4, 4), value))
+    with pytest.raises(LidarError, match="the pose of sweep 2 is not finite"):
+        recording.poses([2])
+
+
+def test_calibrations_that_are_not_finite_are_refused(tmp_path):
+    kitti(tmp_path, range(3), 3)
+    text = (tmp_path / "calib.txt").read_text()
+    (tmp_path / "calib.txt").write_text(re.sub(r"Tr: \S+", "Tr: nan", text))
+    with pytest.raises(LidarError, match=r"calib\.txt: the matrix in line 2 is not finite"):
+        open_recording(tmp_path)
+
+
 def test_poses_of_kitti_without_a_calibration(tmp_path):
     folder = kitti(tmp_path / "s", range(3), 3, calibrated=False)
     recording = open_recording(folder)
@@ -177,7 +204,24 @@ def fired(number):
     return ranges[:, None] * directions, ring, seconds
 
 
-def write_bag(path, sweeps, late_ns=0):
+def transform(number, parent="map", child="lidar", x=None, quaternion=(0, 0, 0, 1)):
+    """Return the TransformStamped of a frame at the stamp of a sweep."""
+    types = STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](
+        *divmod(START_NS + round(1e9 * SWEEP_S * number), 10**9)
+    )
+    x = position(SWEEP_S * number) if x is None else x
+    return types["geometry_msgs/msg/TransformStamped"](
+        types["std_msgs/msg/Header"](stamp, parent),
+        child,
+        types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](float(x), 0.0, 0.0),
+            types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
+        ),
+    )
+
+
+def write_bag(path, sweeps, late_ns=0, transforms=()):
     """Write sweeps (stamp in ns, {field: values}) that were recorded later than stamped."""
     types = STORE.types
     field_type = types["sensor_msgs/msg/PointField"]
@@ -200,6 +244,10 @@ def write_bag(path, sweeps, late_ns=0):
             )
             recorded_ns = START_NS + round(1e9 * SWEEP_S * number) + late_ns
             bag.write(topic, recorded_ns, STORE.serialize_cdr(message, POINT_CLOUD))
+        if transforms:
+            kind = "tf2_msgs/msg/TFMessage"
+            frames = bag.add_connection("/tf", kind, typestore=STORE)
+            bag.write(frames, START_NS, STORE.serialize_cdr(types[kind]([*transforms]), kind))
     return path
 
 
@@ -326,7 +374,69 @@ def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
     simulated = [(stamp_ns - START_NS, columns) for stamp_ns, columns in drive(relative)]
     recording = open_recording(write_bag(tmp_path / "simulated", simulated))
     assert [*recording.stamps_ns] == [1e8 * number for number in range(SWEEPS)]
-    assert recording.notes == ()
+    assert [*recording.notes] == []
+
+
+def transforms_but(number, **changes):
+    """Return transforms of all sweeps, one of which is changed."""
+    return [transform(k, **(changes if k == number else {})) for k in range(SWEEPS)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"x": np.nan},
+        {"quaternion": (0, 0, 0, 0)},
+        {"quaternion": (0, 0, 0, 0.9)},
+    ],
+)
+def test_invalid_transforms_are_skipped(tmp_path, change):
+    path = write_bag(tmp_path / "bag", drive(relative), transforms=transforms_but(3, **change))
+    recording = open_recording(path)
+    expected = [position(SWEEP_S * number) for number in range(SWEEPS)]
+    expected[3] = (expected[2] + expected[4]) / 2
+    for _ in range(2):  # the note is added once
+        np.testing.assert_allclose(recording.poses(range(SWEEPS))[:, 0, 3], expected, atol=1e-6)
+    (note,) = recording.notes
+    assert note == (
+        f"{path} has invalid transforms on its tf topics, which contain NaN or a quaternion whose "
+        "length is not 1. Their times are 1700000000.300000000 (seconds). They are skipped"
+    )
+    with pytest.raises(LidarError, match=r"invalid transforms .* 1700000000\.3.*Remove them"):
+        load_trajectory(path, topic="/tf:lidar")
+
+
+def test_each_reason_for_unknown_poses_is_named(tmp_path):
+    sweeps = drive(relative)
+    reasons = {
+        "no transform of its frame 'lidar' can be used. .* 1700000000.0*, .* and 5 more": [
+            transform(number, x=np.nan) for number in range(SWEEPS)
+        ],
+        "frame 'lidar' has two parent frames, 'map' and 'odom'": transforms_but(3, parent="odom"),
+        "has no pose within 0.2 s of sweep 6, so its poses are not used": [
+            transform(number) for number in (0, 1, 2, 3.5)
+        ],
+        "": [transform(0)],  # a sensor that does not move has no trajectory
+    }
+    for number, (reason, transforms) in enumerate(reasons.items()):
+        recording = open_recording(write_bag(tmp_path / f"{number}", sweeps, transforms=transforms))
+        assert recording.poses(range(SWEEPS)) is None
+        assert len(recording.notes) == bool(reason)
+        assert all(re.search(reason, note) for note in recording.notes)
+
+
+def test_invalid_static_transforms_are_named(tmp_path):
+    moving = [transform(number, child="vehicle") for number in range(SWEEPS)]
+    mounted = transform(0, "vehicle", x=1.5)
+    path = write_bag(tmp_path / "bag", drive(relative), transforms=[*moving, mounted])
+    expected = position(SWEEP_S * np.arange(SWEEPS)) + 1.5
+    poses = open_recording(path).poses(range(SWEEPS))
+    np.testing.assert_allclose(poses[:, 0, 3], expected, atol=1e-6)
+    broken = transform(0, "vehicle", x=np.nan)
+    path = write_bag(tmp_path / "broken", drive(relative), transforms=[*moving, broken])
+    recording = open_recording(path)
+    assert recording.poses(range(SWEEPS)) is None
+    assert "no transform of its frame 'lidar' can be used" in recording.notes[0]
 
 
 def test_sweeps_that_are_out_of_order_are_named(tmp_path):

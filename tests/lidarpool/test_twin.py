@@ -588,7 +588,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
         twin(empty)
     unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
     unknown[7, 0, 3] = np.nan
-    with pytest.raises(LidarError, match="contains an invalid pose for sweep 7"):
+    with pytest.raises(LidarError, match="the pose of sweep 7 is not finite"):
         twin(replace(recording, read_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")

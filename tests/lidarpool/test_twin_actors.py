@@ -264,9 +264,13 @@ def test_rotations_of_boxes_have_the_length_1():
     turned = recorded_rotation((0, 0, 1.001 * half, half), "box 7")
     np.testing.assert_allclose(turned, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=2e-3)
     np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
-    for scale in (0, 1.1, np.nan):
+    for scale in (0, 1.1):
         with pytest.raises(ValueError, match="the quaternion of box 7 has the length"):
             recorded_rotation((0, 0, 0, scale), "box 7")
+    with pytest.raises(ValueError, match="the quaternion of box 7 is not finite"):
+        recorded_rotation((0, 0, 0, np.nan), "box 7")
+    with pytest.raises(ValueError, match=r"the pose of box 7 \(Car\) in sweep 2 is not finite"):
+        RecordedBoxes.from_rows([(2, 7, "Car", np.full((4, 4), np.nan), (4.5, 1.8, 1.5))])
 
 
 def test_results_have_the_boxes_of_their_actors(boxes):

@@ -11,6 +11,7 @@ import pytest
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
+from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.nuscenes_categories import visibility_token
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.writing import ExportSpec
@@ -268,6 +269,25 @@ def test_one_of_several_scenes(tmp_path):
     # The second sweep is empty.
     assert differ == tables | {f"samples/LIDAR_TOP/01/00000{number}.pcd.bin" for number in (0, 2)}
     assert before.keys() == after.keys()
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "reason"),
+    [
+        ("ego_pose", "translation", "the pose in the row with the token {} is not finite"),
+        ("ego_pose", "rotation", "the quaternion of the row with the token {} is not finite"),
+        ("calibrated_sensor", "translation", "the pose in the row with the token {} is not finite"),
+    ],
+)
+def test_poses_that_are_not_finite_are_refused(drive, tmp_path, table, column, reason):
+    source = tmp_path / "source"
+    shutil.copytree(drive, source)
+    rows = json.loads((source / VERSION / f"{table}.json").read_text())
+    rows[0][column][1] = np.nan
+    (source / VERSION / f"{table}.json").write_text(json.dumps(rows))
+    recording = open_recording(source, "LIDAR_TOP")
+    with pytest.raises(LidarError, match=reason.format(rows[0]["token"])):
+        recording.poses(range(len(recording)))
 
 
 def test_tables_of_other_versions_are_unchanged(drive, tmp_path):

@@ -430,7 +430,8 @@ def lidar_poses(rows: Floats, calibration: Path) -> Floats:
     this file does not exist, the matrices are assumed to be lidar poses.
     """
     camera = _calibration(calibration)
-    return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
+    with np.errstate(invalid="ignore"):  # poses that are not finite are refused with their sweep
+        return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
 
 
 def _matrices(path: Path) -> Floats:
@@ -457,9 +458,12 @@ def _calibration(path: Path) -> Floats:
         if key == "Tr":
             reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
             try:
-                return _square(reader.read([values], number).reshape(3, 4))
+                matrix = _square(reader.read([values], number).reshape(3, 4))
             except ValueError as error:
                 raise ValueError(f"{path.name}: {error}") from error
+            if not np.isfinite(matrix).all():
+                raise ValueError(f"{path.name}: the matrix in line {number} is not finite")
+            return matrix
     raise ValueError(
         f"{path.name} has no `Tr:` line, which transforms lidar coordinates to the camera frame "
         f"of the poses. Add this line, or remove {path.name} if the poses are lidar poses."

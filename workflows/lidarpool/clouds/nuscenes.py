@@ -743,7 +743,14 @@ class NuScenesTables:
 
 
 def _pose_of(row: _Row) -> Floats:
-    """Return the pose matrix for a row with a rotation and a translation."""
+    """Return the pose matrix for a row with a rotation and a translation.
+
+    Raises ValueError if the pose is not finite, or if it does not consist of both.
+    """
     w, x, y, z = row["rotation"]
-    rotation = recorded_rotation((x, y, z, w), f"the row with the token {row['token']}")
-    return affine(rotation, np.array(row["translation"]))
+    owner = f"the row with the token {row['token']}"
+    rotation = recorded_rotation((x, y, z, w), owner)
+    pose = affine(rotation, np.array(row["translation"], np.float64))
+    if not np.isfinite(pose).all():
+        raise ValueError(f"the pose in {owner} is not finite. Correct its translation")
+    return pose

@@ -31,10 +31,15 @@ class RecordedBoxes(NamedTuple):
         Raises
         ------
         ValueError
-            If a size is negative or not finite.
+            If a size is negative or not finite, or if a pose is not finite.
         """
         listed = list(rows)
-        for _, box, kind, _, size in listed:
+        for sweep_number, box, kind, pose, size in listed:
+            if not np.isfinite(pose).all():
+                raise ValueError(
+                    f"the pose of box {box} ({kind or 'without a type'}) in sweep {sweep_number} "
+                    "is not finite"
+                )
             if not all(0 <= side < np.inf for side in size):
                 raise ValueError(
                     f"the size of box {box} ({kind or 'without a type'}) must be positive, but is "

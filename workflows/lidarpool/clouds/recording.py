@@ -43,11 +43,14 @@ _MAX_ROTATION_ERROR = 0.01  # maximum deviation of the dot products of the axes 
 _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
-def _check_rotations(poses: Floats, numbers: Sequence[int]) -> None:
-    """Raise ValueError unless the poses (n, 4, 4) of some sweeps consist of rotations and shifts.
-
-    Unknown poses, which contain NaN, are accepted.
-    """
+def _check_poses(poses: Floats, numbers: Sequence[int]) -> None:
+    """Raise ValueError unless the poses (n, 4, 4) of some sweeps are rotations and translations."""
+    broken = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
+    if len(broken):
+        raise ValueError(
+            f"the pose of sweep {numbers[broken[0]]} is not finite. Correct the pose, or remove "
+            "the poses from the recording"
+        )
     rotations = poses[:, :3, :3]
     errors = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     wrong = np.flatnonzero((errors > _MAX_ROTATION_ERROR) | (np.linalg.det(rotations) < 0))
@@ -164,7 +167,7 @@ class Recording:
         Classes of noise points, which are omitted together with withheld points. None to keep all
         points.
     notes
-        Sentences for the user.
+        Sentences for the user. Notes about poses are added when the poses are read.
     """
 
     name: str
@@ -193,7 +196,7 @@ class Recording:
     energies: bool = False
     ray_times: RayTimes | None = None
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     # {number of an item: points omitted from it}
     _omitted: dict[int, OmittedPoints] = field(default_factory=dict, init=False)
 
@@ -282,7 +285,7 @@ class Recording:
             points = np.asarray(points, np.float64) * self.meters
         pose = sweep._pose
         if pose is not None and not callable(pose):
-            _check_rotations(np.asarray(pose)[None], [number or 0])
+            _check_poses(np.asarray(pose)[None], [number or 0])
         if self.meters != METERS and sweep.pose is not None:
             pose = sweep.pose.copy()
             pose[:3, 3] *= self.meters
@@ -341,12 +344,15 @@ class Recording:
             If the recording cannot be read.
         """
         if self.read_poses is not None:
+            chosen = list(numbers)
             with reading(self.name):
                 all_poses = self.read_poses()
-            if all_poses is not None:
-                matrices = np.array(all_poses[list(numbers)], np.float64).reshape(-1, 4, 4)
-                matrices[:, :3, 3] *= self.meters
-                return matrices
+                if all_poses is not None:
+                    matrices = np.array(all_poses[chosen], np.float64).reshape(-1, 4, 4)
+                    _check_poses(matrices, chosen)
+                    matrices[:, :3, 3] *= self.meters
+                    return matrices
+            numbers = chosen
         poses = []
         for number in numbers:
             pose = self[number].pose

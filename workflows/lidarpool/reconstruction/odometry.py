@@ -91,12 +91,6 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses, times_s = _read_poses(sweeps, trajectory, times_s)
         return RecordedPoses.in_world(poses, times_s, f"from {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
-    if recorded is not None and not np.isfinite(recorded).all():
-        number = int(np.flatnonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0])
-        raise LidarError(
-            f"{sweeps.recording.name} contains an invalid pose for sweep {number}. Pass the "
-            "poses with `--trajectory`."
-        )
     fraction = 0.0
     first_s = 0.0
     # In recordings with one file per sweep, many files state the same default pose, such as

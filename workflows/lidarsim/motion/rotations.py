@@ -127,9 +127,11 @@ def recorded_rotation(quaternion: Sequence[float], owner: str) -> Floats:
     Raises
     ------
     ValueError
-        If the length of the quaternion is not 1, apart from rounding errors.
+        If the quaternion is not finite, or if its length is not 1 apart from rounding errors.
     """
     values = np.asarray(quaternion, np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError(f"the quaternion of {owner} is not finite")
     length = float(np.sqrt((values * values).sum()))
     if not abs(length - 1) < _MAX_LENGTH_ERROR:
         raise ValueError(
