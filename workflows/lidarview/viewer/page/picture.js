@@ -554,6 +554,10 @@ export class Picture {
     const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
     if (this.isHigh) target.z = this.middle.z; // the ground is far below
+    else { // look down far enough to show the ground below the platform
+      const down = Math.atan2(eye.z - this.box[0].z, back) - (0.92 * FOV * Math.PI) / 360;
+      target.z = Math.min(target.z, eye.z - Math.tan(down) * (back + 0.3 * this.extent));
+    }
     this.useParallel(false);
     this.place(eye, target);
   }
