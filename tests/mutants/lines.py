@@ -67,7 +67,8 @@ class Lines:
         environment = os.environ | {"LIDARPOOL_MUTANTS": str(folder)}
         subprocess.run([*command, *pytest_options, *files], cwd=root, env=environment, check=False)
         path = folder / "lines.json"
-        recorded = cls.read(path) if files else cls([], {}, {}, {}, {})
+        is_update = bool(files) and path.is_file()
+        recorded = cls.read(path) if is_update else cls([], {}, {}, {}, {})
         for part in folder.glob("gw*.json"):
             recorded._add(root, json.loads(part.read_text()))
         recorded._write(path)
