@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -105,10 +106,70 @@ def test_clouds_without_common_times_are_not_paired():
     points = plane(1000)
     a, b = cloud(points, time=np.arange(1000)), cloud(points, time=np.arange(1000) + 5000)
     assert compare_surveys(a, b).figures["method"] == "planes"
-    with pytest.raises(LidarError, match="hardly any points with the same time"):
+    with pytest.raises(
+        LidarError, match="hardly any points of cloud A and cloud B have the same time"
+    ):
         compare_surveys(a, b, method="pairs")
     with pytest.raises(LidarError, match="no column `time` or `gps_time` in common"):
         compare_surveys(cloud(points), b, method="pairs")
+
+
+TIMES = {
+    "zero": (np.zeros(500), "the gps time of all points in cloud {} is 0"),
+    "constant": (np.full(500, 3.2e8), r"the gps time of all points in cloud {} is 3.2e\+08"),
+    "nan": (np.full(500, np.nan), "the gps time of the points in cloud {} is not finite"),
+    "infinite": (np.full(500, -np.inf), "the gps time of the points in cloud {} is not finite"),
+    "coarse": (
+        np.repeat(np.arange(50.0), 10),
+        "most points in cloud {} have the same gps time as another point",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TIMES)
+@pytest.mark.parametrize("wrong", ["A", "B"])
+def test_what_does_not_identify_points_is_named(name, wrong):
+    times, says = TIMES[name]
+    points = plane(500)
+    clouds = {
+        key: cloud(points, gps_time=times if key == wrong else np.arange(500.0)) for key in "AB"
+    }
+    reason = says.format(wrong)
+    with pytest.raises(LidarError, match=rf"{reason}\. Use `--survey planes`\.$"):
+        compare_surveys(clouds["A"], clouds["B"], method="pairs")
+    found = compare_surveys(clouds["A"], clouds["B"], radius_m=2)
+    assert found.figures["method"] == "planes"
+    assert any(re.search(f"because {reason}, so", note) for note in found.figures["notes"])
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        1.7e27 + np.arange(900) * 1e18,  # more tenths of a microsecond than an integer can count
+        -4e20 - np.arange(900) * 1e9,
+        np.arange(900, dtype=np.uint64) + np.uint64(2**63),
+        np.arange(900, dtype=np.float32),
+    ],
+)
+def test_times_of_any_size_identify_points(times):
+    points = plane(900)
+    order = np.random.default_rng(20).permutation(900)
+    a = cloud(points[order] + SHIFT, gps_time=times[order])
+    one = components(compare_surveys(a, cloud(points, gps_time=times), method="pairs"), "delta_n")
+    assert one["count"] == 900
+    assert one["mean_m"] == pytest.approx(SHIFT[1], abs=1e-8) and one["std_m"] < 1e-8
+
+
+def test_points_without_a_time_are_counted():
+    points = plane(800)
+    time = np.arange(800.0)
+    time[5:12] = np.nan
+    a = cloud(points, gps_time=np.arange(800.0))
+    found = compare_surveys(a, cloud(points, gps_time=time))
+    assert components(found, "delta_e")["count"] == 793
+    assert found.figures["unpaired"] == {"a": 7, "b": 0}
+    note = "7 points of cloud B have a gps time that is not finite and are not compared"
+    assert note in found.figures["notes"]
 
 
 def test_rows_of_floating_point_times_have_the_same_key_if_they_are_equal_to_a_tenth_microsecond():

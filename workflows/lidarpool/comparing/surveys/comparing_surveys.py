@@ -14,7 +14,7 @@ from lidarsim.words import join_names
 from .deviations import Deviations, statistics
 from .m3c2 import m3c2_deviations
 from .mesh import is_mesh, mesh_deviations
-from .pairs import find_key, pair_deviations
+from .pairs import UnpairedError, pair_deviations
 from .planes import neighborhood_radius, plane_deviations
 from .strips import StripSettings, strip_deviations
 from .survey_clouds import CloudSource, SurveyCloud, check_overlap, check_same_frame
@@ -122,14 +122,19 @@ def compare_surveys(
     second = SurveyCloud.open(b, "cloud B", sensor=sensor_b, unit=unit_b, keep_noise=keep_noise)
     notes = check_same_frame([first, second])
     if method in {"auto", "pairs"}:
-        found = _pair(first, second, max_points, required=method == "pairs")
-        if found is not None:
+        try:
+            found = pair_deviations(first, second, max_points)
+        except UnpairedError as error:
+            if method == "pairs":
+                raise
+            notes.append(
+                f"points cannot be paired, because {error.reason}, so distances from planes are "
+                "compared"
+            )
+            method = "planes"
+        else:
             _check_options("pairs", given)
             return _summarize("pairs", [first, second], found, notes)
-        notes.append(
-            "points cannot be paired by time or ray, so distances from planes are compared"
-        )
-        method = "planes"
     _check_options(method, given)
     found, more = _distances(method, first, second, radius_m, max_distance_m, max_points)
     return _summarize(method, [first, second], found, notes + more)
@@ -195,24 +200,6 @@ def _check_options(
                 f"The option `{name.removesuffix('_m').replace('_', '-')}` does not apply to the "
                 f"method {method}.{hint}"
             )
-
-
-def _pair(a: SurveyCloud, b: SurveyCloud, max_points: int, *, required: bool) -> Deviations | None:
-    """Return the deviations of paired points, or None if points cannot be paired.
-
-    Raises LidarError if points must be paired.
-    """
-    key = find_key(a, b)
-    found = None if key is None else pair_deviations(a, b, key, max_points)
-    if found is None and required:
-        reason = "have no column `time` or `gps_time` in common"
-        if key is not None:
-            reason = f"have hardly any points with the same {key.title}"
-        raise LidarError(
-            f"The points of {a.name} and {b.name} cannot be paired, because they {reason}. Run "
-            "both surveys with `cloud: {columns: [time]}`, or use `--survey planes`."
-        )
-    return found
 
 
 def _distances(
