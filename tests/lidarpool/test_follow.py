@@ -81,6 +81,8 @@ class Loop:
         self.notes: list[str] = []
         self.sweeps: list[Sweep] = []
         self.frames: list[Any] = []
+        self.programs = 1
+        self.clock_is_shared = False
         self._arrived: list[RosMessage] = []
         self.node = create_node(sources, (self, self), FollowOptions(**options), self.notes.append)
         self.node.start()
@@ -105,8 +107,12 @@ class Loop:
         yield from arrived
 
     def publishers(self, topic: str) -> int:
-        del topic
-        return 1
+        assert topic == "/clock"
+        return self.programs
+
+    def is_shared(self, topic: str) -> bool:
+        assert topic == "/clock"
+        return self.clock_is_shared
 
     def send(self, *messages: RosMessage) -> None:
         assert all(is_wanted(message.topic, message.kind) for message in messages)
@@ -462,6 +468,21 @@ def test_the_clock_is_stated_after_waiting(folder, monkeypatch):
     assert waiting.endswith("Waiting.") and received == "Messages on /clock are arriving."
 
 
+def test_a_clock_that_is_missing_or_shared_is_stated(folder, monkeypatch):
+    with Loop("room.sdf") as loop:
+        monkeypatch.setattr("lidarpool.following.node._QUIET_S", 0)
+        loop.node.step()
+        loop.programs = 0
+        loop.node.step()
+        monkeypatch.undo()
+        loop.clock_is_shared = True
+        loop.play(lambda _: STILL, 0, 0.3)
+    paused, absent, received, shared = loop.notes
+    assert "seems to be paused" in paused and "No program publishes it" in absent
+    assert shared.startswith("Several programs publish /clock. Stop all simulators but one")
+    assert received == "Messages on /clock are arriving."
+
+
 def test_repeated_events_are_counted(monkeypatch):
     shown: list[str] = []
     notices = Notices(shown.append)
@@ -490,9 +511,12 @@ def test_poses_that_are_rare_are_stated_and_held(folder):
 def test_a_sensor_whose_frame_is_not_known_waits(folder):
     (folder / "sensors.yaml").write_text(SENSORS.replace("robot/lidar", "drone/lidar"))
     with Loop("room.sdf") as loop:
+        assert loop.notes == [
+            "No pose is known for drone/lidar, the frame of the sensor roof. The sensor publishes "
+            "nothing until its pose is received. Did you mean 'robot/lidar'?"
+        ]
         loop.play(lambda _: STILL, 0, 0.3)
-        assert not loop.clouds()
-        assert notes_of(loop, "No pose is known for drone/lidar, the frame of the sensor roof")
+        assert not loop.clouds() and not loop.notes[1:]
         loop.play(lambda _: [*STILL, ("drone/lidar", "room", (0, 0, 2), 0.0)], 0.32, 0.7)
         assert loop.clouds()
 

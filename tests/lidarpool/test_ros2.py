@@ -256,6 +256,34 @@ def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
         assert subscriber.publishers("/clock") == 2
 
 
+def test_a_program_that_is_restarted_does_not_share_its_topics(dds):
+    """A program that was killed remains announced for ten seconds, but it is silent."""
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    kind = dds.message_class("rosgraph_msgs/msg/Clock")
+    with dds.RosPublisher(dds.Network(domain=DOMAIN + 7)) as connection:
+        subscriber = dds.RosSubscriber(connection, lambda *_: True, pytest.fail)
+        participant = DomainParticipant(DOMAIN + 7)
+        topic = Topic(participant, "rt/clock", kind)
+        first, second, third = (DataWriter(participant, topic) for _ in range(3))
+
+        def publish(writer, time_s: float) -> None:
+            """Publish a time, again and again until it arrives, which takes discovery."""
+            stop = time.monotonic() + 60
+            cdr = bytes(simulators.clock(time_s).cdr)
+            while cdr not in [bytes(message.cdr) for message in subscriber.receive(0.05)]:
+                writer.write(kind.deserialize(cdr))
+                assert time.monotonic() < stop
+
+        for number, writer in enumerate((first, first, second, second, third, third)):
+            publish(writer, number)
+        assert subscriber.publishers("/clock") == 3 and not subscriber.is_shared("/clock")
+        publish(first, 6)
+        assert subscriber.is_shared("/clock") and not subscriber.is_shared("/tf")
+
+
 def clock_classes(*, suffix: str = "_", name: str = "dds_.Clock_") -> tuple[Any, Any]:
     """Return the classes Time and Clock, as a program without ROS may define them."""
     from cyclonedds.idl import make_idl_struct, types

@@ -346,11 +346,11 @@ def broken(field: str, value: float) -> dict[str, Any]:
     ("changes", "code", "message"),
     [
         ({"scene_id": "field"}, "NOT_FOUND", "The available scene is 'yard'"),
-        ({"lidar_config": {"lidar_type": AT128}}, "INVALID_ARGUMENT", "--sensor AT128=MODEL"),
         ({"lidar_config": {"lidar_type": 7}}, "INVALID_ARGUMENT", "lidar_type 7 is unknown"),
         ({"frame_end_us": 1_000_000}, "INVALID_ARGUMENT", "must be greater than frame_start_us"),
         ({"frame_end_us": 1_050_000}, "INVALID_ARGUMENT", "50 ms, but a sweep of Line lasts 100"),
-        ({"frame_end_us": (1 << 64) - 1}, "INVALID_ARGUMENT", "times in microseconds"),
+        ({"frame_start_us": 1 << 63}, "INVALID_ARGUMENT", "but they are 1100000 and 92233720368"),
+        ({"frame_end_us": (1 << 64) - 1}, "INVALID_ARGUMENT", "but a sweep of Line lasts 100 ms"),
         ({"sensor_pose": None}, "INVALID_ARGUMENT", "sensor_pose of the sensor is missing"),
         ({"sensor_pose": {}}, "INVALID_ARGUMENT", "start_pose.quat of the sensor has the norm 0"),
         ({"sensor_pose": broken("vec.y", np.nan)}, "INVALID_ARGUMENT", "end_pose.vec .* finite"),
@@ -498,6 +498,25 @@ def test_wrong_arguments_are_explained(folder, monkeypatch, arguments, message):
     monkeypatch.chdir(folder)
     result = CliRunner().invoke(cli, ["serve", *arguments])
     assert message in f"{result.exception}{result.output}"
+
+
+def test_a_device_without_a_model_keeps_its_default(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(SensorServer, "wait", lambda server: None)
+    served = {
+        "PANDAR128": "PANDAR128 is Line, AT128 is Hesai AT128",
+        "AT128": "PANDAR128 is Hesai Pandar128, AT128 is Line",
+    }
+    for device, line in served.items():
+        arguments = ["serve", "yard.yaml", "--sensor", f"{device}=line.yaml"]
+        result = CliRunner().invoke(cli, [*arguments, "--listen", "127.0.0.1:0"])
+        assert f", {line}. Press" in result.output
+
+
+def test_times_of_a_frame_have_no_limit(client):
+    last = (1 << 64) - 1
+    late = request(frame_start_us=last - 100_000, frame_end_us=last)
+    assert xyz(client.render_lidar(**late))[0, 0] == pytest.approx(10, abs=2e-4)
 
 
 def test_the_box_of_a_recorded_actor_is_that_of_the_twin(folder, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -112,9 +111,7 @@ def serve(
     server = SensorServer(service, endpoint)
     with options.summary_at_end(lambda: service.summary), server:
         sensors = ", ".join(
-            f"{device} is {served.sensors[number].name}"
-            for device, number in DEVICES.items()
-            if number in served.sensors
+            f"{device} is {served.sensors[number].name}" for device, number in DEVICES.items()
         )
         click.echo(
             f"ready: scene {served.name} on {server.address}, {sensors}. Press Ctrl-C to stop."
@@ -133,14 +130,12 @@ def _write_proto(path: Path) -> None:
     click.echo(str(path))
 
 
-def _models(texts: tuple[str, ...]) -> dict[str, Any]:
-    """Return the model of each device.
+def _models(texts: tuple[str, ...]) -> dict[str, str]:
+    """Return the model of each device, which is the default unless an option replaces it.
 
     Raise LidarError if a device is unknown or has several models.
     """
-    if not texts:
-        return dict(_DEFAULT_MODELS)
-    models: dict[str, Any] = {}
+    models: dict[str, str] = {}
     for text in texts:
         device, has_device, model = text.partition("=")
         devices = [device] if has_device else [*_DEFAULT_MODELS]
@@ -153,4 +148,4 @@ def _models(texts: tuple[str, ...]) -> dict[str, Any]:
             if key in models:
                 raise LidarError(f"`--sensor` names two models for {key}. Specify one of them.")
             models[key] = model if has_device else text
-    return models
+    return _DEFAULT_MODELS | models

@@ -11,7 +11,7 @@ from typing import NoReturn, Protocol
 import numpy as np
 
 from lidarsim.errors import LidarError
-from lidarsim.words import join_names, list_names, plural
+from lidarsim.words import join_names, list_names, name_hint, plural
 from lidarsim.worlds.frame_tree import FrameTree
 
 from ..clouds.ros.messages import CLOCK_TOPIC, RosMessage
@@ -63,6 +63,9 @@ class MessageSource(Protocol):
 
     def publishers(self, topic: str) -> int:
         """Return the number of programs that publish a topic."""
+
+    def is_shared(self, topic: str) -> bool:
+        """Return whether messages of several programs on a topic arrive in turns."""
 
 
 class FollowNode:
@@ -149,6 +152,8 @@ class FollowNode:
             message = sensor.static_frame()
             if message is not None:
                 self._publisher.publish(message)
+            if not sensor.has_pose(self._tree):
+                self._report_missing(sensor)
         self._clock_s = time.monotonic()  # building the scanners can take long
 
     def run(self) -> NoReturn:
@@ -227,7 +232,8 @@ class FollowNode:
         if has_jumped:
             self._poses.restart()
         self._poses.set_clock(time_ns)
-        if self._notices.clear("quiet"):
+        was_quiet = [self._notices.clear(("quiet", is_published)) for is_published in (False, True)]
+        if any(was_quiet):
             self._notices.show_event("clock received", "Messages on /clock are arriving.")
         if last_ns is None:
             self._restart(time_ns)
@@ -255,21 +261,22 @@ class FollowNode:
 
     def _check_publishers(self) -> None:
         """Show a notice if no clock, or more than one, is published."""
-        publishers = self._subscriber.publishers(CLOCK_TOPIC)
-        if publishers > 1:
+        if self._subscriber.is_shared(CLOCK_TOPIC):
             self._notices.show(
                 "clocks",
-                f"{publishers} programs publish /clock. Stop all simulators but one, because the "
-                "time would jump between their clocks.",
+                "Several programs publish /clock. Stop all simulators but one, because the time "
+                "jumps between their clocks.",
             )
         else:
             self._notices.clear("clocks")
         if time.monotonic() - self._clock_s > _QUIET_S:
+            is_published = self._subscriber.publishers(CLOCK_TOPIC) > 0
             reason = "The simulator seems to be paused"
-            if not publishers:
+            if not is_published:
                 reason = "No program publishes it. Start the simulator, and bridge its clock"
             self._notices.show(
-                "quiet", f"No message on /clock for {_QUIET_S:g} s. {reason}. Waiting."
+                ("quiet", is_published),
+                f"No message on /clock for {_QUIET_S:g} s. {reason}. Waiting.",
             )
 
     def _next_due(self) -> FollowedSensor | None:
@@ -336,11 +343,7 @@ class FollowNode:
         end_s = self._ends_s.pop(sensor, self._clock_s)
         if sensor in self._lost or not sensor.has_pose(self._tree):
             sensor.number += 1
-            self._notices.show(
-                ("missing", sensor.name),
-                f"No pose is known for {sensor.frame}, the frame of the sensor {sensor.name}. The "
-                "sensor publishes nothing until its pose is received.",
-            )
+            self._report_missing(sensor)
             return
         self._notices.clear(("missing", sensor.name))
         try:
@@ -356,6 +359,16 @@ class FollowNode:
             self._publisher.publish(message)
         self.published += 1
         self._delays_s.append(time.monotonic() - end_s)
+
+    def _report_missing(self, sensor: FollowedSensor) -> None:
+        """Show a notice about a sensor whose frame has no pose."""
+        frames = self._world.frames
+        hint = "" if sensor.frame in frames else name_hint(sensor.frame, [*frames])
+        self._notices.show(
+            ("missing", sensor.name),
+            f"No pose is known for {sensor.frame}, the frame of the sensor {sensor.name}. The "
+            f"sensor publishes nothing until its pose is received.{hint}",
+        )
 
     def _add_models(self) -> None:
         """Add models that were spawned."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import math
 import os
 import socket
 import time
@@ -60,6 +61,8 @@ _DEPTHS = {CLOCK_TOPIC: 1, "/tf": 100}
 _DEPTH = 10
 _RECEIVED_DEPTH = 5000  # messages of a topic that are kept until they are read
 _TAKEN = 1000  # messages that are taken at once
+_SHARED_S = 5.0  # how long a topic counts as shared after its publishers have taken turns
+_MAX_SENDERS = 16  # publishers of a topic that are remembered
 # Time to wait for further messages, since /clock alone can have a thousand per second.
 _GATHER_S = 0.003
 
@@ -242,10 +245,19 @@ class RosSubscriber:
         # Readers by topic, message type, and whether they receive old messages.
         self._readers: dict[tuple[str, str, bool], _Reader] = {}
         self._writers: dict[Any, str] = {}  # {key of a publisher: topic}
+        self._senders: dict[str, list[int]] = {}  # publishers by topic, in the order of appearance
+        self._shared_s: dict[str, float] = {}  # {topic: when its publishers last took turns}
 
     def publishers(self, topic: str) -> int:
-        """Return the number of programs that publish a topic."""
+        """Return the number of programs that publish a topic.
+
+        A program that was killed counts for another 10 seconds.
+        """
         return sum(published == topic for published in self._writers.values())
+
+    def is_shared(self, topic: str) -> bool:
+        """Return whether messages of several programs on a topic arrive in turns."""
+        return time.monotonic() - self._shared_s.get(topic, -math.inf) < _SHARED_S
 
     def receive(self, wait_s: float) -> Iterator[RosMessage]:
         """Yield the messages that have arrived, starting with those of the clock.
@@ -260,7 +272,20 @@ class RosSubscriber:
         for (topic, kind, _), reader in readers:
             # Not all samples are taken, because a flood of messages never ends.
             for sample in reader.data_reader.take_serialized(_TAKEN):
+                self._record_sender(topic, sample.publisher)
                 yield RosMessage(topic, kind, sample.time_ns, sample.cdr)
+
+    def _record_sender(self, topic: str, publisher: int) -> None:
+        """Record which program has sent a message.
+
+        A program that is restarted has a new publisher, and its old one is silent.
+        """
+        senders = self._senders.setdefault(topic, [])
+        if publisher not in senders:
+            senders.append(publisher)
+            del senders[:-_MAX_SENDERS]
+        elif publisher != senders[-1]:
+            self._shared_s[topic] = time.monotonic()
 
     def _attach(self, reader: Any) -> ReadCondition:
         """Let messages of a reader end waiting."""

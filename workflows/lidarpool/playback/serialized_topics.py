@@ -148,6 +148,7 @@ class SerializedSample(NamedTuple):
     """A received message."""
 
     time_ns: int  # when it was sent, in Unix time
+    publisher: int  # identifies the writer that sent it
     cdr: bytes
 
 
@@ -164,7 +165,9 @@ class SerializedReader(DataReader):
             if info.valid_data:
                 cdr = ctypes.create_string_buffer(_size(pointer))
                 _to_bytes(pointer, 0, len(cdr), cdr)
-                samples.append(SerializedSample(info.source_timestamp, cdr.raw))
+                samples.append(
+                    SerializedSample(info.source_timestamp, info.publication_handle, cdr.raw)
+                )
             _release(pointer)
         yield from samples
 

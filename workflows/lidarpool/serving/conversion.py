@@ -16,7 +16,6 @@ from .served_scene import Drive, FramePoses, SensorPoints, SweepRequest
 
 MAX_OBJECTS = 10_000  # maximum number of objects in a request
 _MAX_LETTERS = 256  # maximum length of an object name
-_MAX_START_US = 1 << 62
 
 
 def sweep_request(message: Any) -> SweepRequest:
@@ -28,7 +27,7 @@ def sweep_request(message: Any) -> SweepRequest:
         If a value is missing or invalid. The message names the field.
     """
     start_us, end_us = message.frame_start_us, message.frame_end_us
-    if not start_us < end_us <= _MAX_START_US:
+    if not start_us < end_us:
         raise LidarError(
             f"frame_end_us must be greater than frame_start_us, but they are {end_us} and "
             f"{start_us}. Both are times in microseconds."

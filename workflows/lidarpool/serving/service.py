@@ -15,7 +15,7 @@ from lidarsim.errors import LidarError
 from lidarsim.words import plural, printable
 
 from .conversion import points_message, sweep_request, trajectory_message
-from .messages import DEVICES, METHODS, SERVICE, message_class
+from .messages import METHODS, SERVICE, message_class
 from .served_scene import SensorPoints, ServedScene
 
 MAX_POINTS = 2_000_000  # maximum number of points in a reply; as lists and buffers, 64 MB
@@ -128,14 +128,7 @@ class SensorService:
         device = request.lidar_config.lidar_type
         sensor = self._scene.sensors.get(device)
         if sensor is None:
-            names = {number: name for name, number in DEVICES.items()}
-            name = names.get(device)
-            raise LidarError(
-                f"lidar_type {device} is unknown."
-                if name is None
-                else f"No sensor is served as {name}. Restart the server with --sensor "
-                f"{name}=MODEL."
-            )
+            raise LidarError(f"lidar_type {device} is unknown.")
         sweep = sweep_request(request)
         if self._ignores_unknown:
             known = {name: p for name, p in sweep.objects.items() if name in self._scene.actors}
