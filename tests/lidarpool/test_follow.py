@@ -378,6 +378,7 @@ sensor: velodyne/vlp16
 mount: [0, 0, 1]
 trajectory: {points: [{time_s: 0, position: [0, 0, 0]}, {time_s: 9, position: [9, 0, 0]}]}
 cloud: {keep_every: 2, columns: [time]}
+faults: [{kind: dirt, transmission: 0.3}]
 """)
 
     def frames(time_s):
@@ -386,7 +387,7 @@ cloud: {keep_every: 2, columns: [time]}
     with Loop("scan.yaml", sensors=None) as loop:
         loop.play(frames, 0, 0.3)
     (unused,) = notes_of(loop, "not used")
-    assert "trajectory, cloud.keep_every. To move" in unused
+    assert "trajectory, faults, cloud.keep_every. To move" in unused
     clouds = loop.clouds("/points")
     assert len(clouds) == 2
     x, y, z = clouds[1].points.T

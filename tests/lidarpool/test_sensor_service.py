@@ -423,7 +423,7 @@ def test_fields_that_have_no_effect_are_reported(folder):
     notes: list[str] = []
     load_served_scene(folder / "thinned.yaml", {PANDAR128: str(folder / "line.yaml")}, notes.append)
     assert [note.partition(": ")[2] for note in notes] == [
-        "These fields are not used: cloud.keep_every, faults."
+        "These fields are not used: faults, cloud.keep_every."
     ]
 
 

@@ -605,9 +605,10 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
         level = sweep.points[:, 2] < -1.75  # of the floor, 1.8 m below the sensor
         return Sweep(sweep.points, {"ring": sweep.rings, "class": np.where(level, 11, 50)})
 
-    found = twin(replace(opened, read=read))
+    found = twin(replace(opened, read=read, read_classes=lambda: {11: "floor", 50: "house"}))
     found.save(tmp_path / "twin")
     job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    assert job.survey.classes == {0: "unlabeled", 11: "floor", 50: "house"}
     scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, 36)))
     cloud = scan.cloud((SCAN, *job.survey.stored_columns[3:]), 1e-4, job.scene.origin)
     height = cloud.positions[:, 2]

@@ -130,6 +130,10 @@ def test_traffic_becomes_actors(effects):
         ("cloud: {columns: [range]}", ["`cloud` cannot be applied"]),
         ("output: {write: [las]}", ["`output` cannot be applied", "`--format`"]),
         ("planning: {start: [0, 0], target: [1, 1]}", ["`planning` cannot be applied"]),
+        (
+            "flight: {density_m2: 5, area: [[[0, 0], [1, 0], [1, 1]]]}",
+            ["`flight` cannot be applied", "Remove `flight`"],
+        ),
         ("pool: {gpu: 2}", ["`pool` cannot be applied", "`--workers`"]),
         ("returns: {subrays: 7}", ["`returns.subrays` cannot be applied", "lidarpool twin"]),
         ("returns: {divergence_mrad: 3}", ["`returns.divergence_mrad` cannot be applied"]),

@@ -137,8 +137,9 @@ def check_spray(scenario: Scenario, actors: tuple[Actor, ...]) -> None:
 def _section_errors(scenario: Scenario) -> Iterator[str]:
     """Yield a sentence for each section or field that cannot be applied to a recording."""
     changed = _changed_fields(scenario)
-    for name in sorted(changed & _OTHER_SECTIONS.keys()):
-        yield f"`{name}` cannot be applied to a recording, {_OTHER_SECTIONS[name]}"
+    for name in sorted(changed - {*SECTIONS}):
+        default = f"because it describes a survey. Remove `{name}`."
+        yield f"`{name}` cannot be applied to a recording, {_OTHER_SECTIONS.get(name, default)}"
     for section in ("noise", "returns"):
         for name in sorted(_changed_fields(getattr(scenario, section))):
             if reason := _OTHER_FIELDS.get(f"{section}.{name}"):

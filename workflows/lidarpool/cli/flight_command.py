@@ -17,7 +17,7 @@ from lidarsim.words import format_rounded
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
-from .planned_scene import comment_lines, prepared_with_notes, scene_sections, sensor_entry
+from .planned_scene import carried_sections, comment_lines, prepared_with_notes, sensor_entry
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ PICTURE_FILE = "flight.png"
 GEOJSON_FILE = "flight.geojson"
 KML_FILE = "flight.kml"
 FILES = (SCENARIO_FILE, PATH_FILE, PICTURE_FILE, GEOJSON_FILE, KML_FILE)
+_COLUMNS = ["time", "range"]
 _SHOWN_LINES = 20  # maximum number of lines listed individually
 _STEP_DEG = 360  # time step in degrees of the scanner's cycle, so one cycle per scan
 _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degrees
@@ -210,13 +211,17 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     scanner = AirborneScanner.load(full_name(model), settings.pop("fov_deg"))
     site = _read_site(area, settings.pop("terrain"), settings.pop("epsg"), of_mesh, terminal)
     folder = settings.pop("out") or Path(f"{site.name}-flight")
-    overwrites = settings.pop("overwrite")
     with result_folder(folder):
-        check_not_existing((folder / name for name in FILES), overwrite=overwrites)
+        files = (folder / name for name in FILES)
+        check_not_existing(files, overwrite=settings.pop("overwrite"))
         with terminal.status("planning the flight lines"):
             plan = plan_flight(site.shape, site.terrain, scanner, **settings)
-        density = _write_plan(plan, site, folder, terminal)
-    notes = [*site.notes, *plan.notes, *_density_notes(plan, density)]
+        sections, omissions = _site_sections(plan, site, folder)
+        plan_notes = [*omissions, *plan.notes]
+        data = sections | _plan_sections(plan, folder)
+        data["cloud"] = data.pop("cloud")  # the last section, which the guide continues
+        density = _write_plan(plan, site, data, plan_notes, folder, terminal)
+    notes = [*site.notes, *plan_notes, *_density_notes(plan, density)]
     if site.epsg is None:
         notes.append(
             f"{KML_FILE} is not written, and {GEOJSON_FILE} contains the coordinates of the plan, "
@@ -321,8 +326,18 @@ def _area_name(area: str) -> str:
     return path.stem if path.suffix in (".geojson", ".json", ".wkt", ".txt") else "area"
 
 
-def _write_plan(plan: FlightPlan, site: _Site, folder: Path, terminal: Terminal) -> AreaDensity:
-    """Write all files of a plan, and return the expected density in the area."""
+def _write_plan(
+    plan: FlightPlan,
+    site: _Site,
+    data: dict[str, Any],
+    notes: list[str],
+    folder: Path,
+    terminal: Terminal,
+) -> AreaDensity:
+    """Write all files of a plan, and return the expected density in the area.
+
+    `data` is the content of the scenario, and `notes` are written to its head.
+    """
     from ..clouds.folder import staging
     from ..plan.flight_density import expected_density, summarize_density
     from ..plan.flight_files import to_geojson, to_kml
@@ -330,22 +345,22 @@ def _write_plan(plan: FlightPlan, site: _Site, folder: Path, terminal: Terminal)
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
 
-    data = _scenario_data(plan, site, folder)
     with (
         explain_os_errors(f"The plan cannot be written to {folder}", "free some disk space"),
         staging(folder) as staged,
     ):
         (staged / PATH_FILE).write_text(_path_text(plan), "ascii", newline="\n")
+        source = "plan" if site.scenario is None else site.scenario.source
         here = data | {
             "trajectory": data["trajectory"] | {"file": str((staged / PATH_FILE).resolve())}
         }
         with terminal.status("estimating the density"):
-            prepared = prepare(Scenario.from_data(here, source="plan", folder=folder), plans=False)
+            prepared = prepare(Scenario.from_data(here, source=source, folder=folder), plans=False)
             scene = prepared.scene.with_world_origin((0, 0, 0))
             area = data["flight"]["area"]
             expected = expected_density(scene, prepared.survey, area)
             density = summarize_density(expected, data["flight"]["density_m2"])
-        text = _head(plan, density) + _yaml(data)
+        text = _head(plan, density, notes) + _yaml(data)
         (staged / SCENARIO_FILE).write_text(text, "utf-8", newline="\n")
         geojson = to_geojson(plan, site.epsg, site.origin)
         (staged / GEOJSON_FILE).write_text(geojson, "utf-8", newline="\n")
@@ -367,12 +382,14 @@ def _yaml(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def _scenario_data(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any]:
-    """Return the content of the scenario, in which the scanner has one entry per flight line."""
+def _plan_sections(plan: FlightPlan, folder: Path) -> dict[str, Any]:
+    """Return the sections of the scenario that a plan replaces.
+
+    The scanner has one entry per flight line.
+    """
     parts = getattr(plan.area, "geoms", [plan.area])
     rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
     return {
-        **_site_sections(plan, site, folder),
         "trajectory": {"file": PATH_FILE, "interpolation": "smooth"},
         "sensors": _sensor_sections(plan, folder),
         "flight": {
@@ -381,23 +398,24 @@ def _scenario_data(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any
                 [[round(x, 3), round(y, 3)] for x, y, *_ in ring.coords[:-1]] for ring in rings
             ],
         },
-        "cloud": {"precision_m": 0.001, "columns": ["time", "range"]},
     }
 
 
-def _site_sections(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any]:
-    """Return the sections `scene` and `world` of the scenario."""
-    reach_m = plan.layout.agl_m * max(plan.scanner.tangent, plan.scanner.ahead)
-    margin_m = max(math.ceil(reach_m * _GROUND_MARGIN), _MIN_MARGIN_M)
-    sections: dict[str, Any] = {"scene": {"ground": {"height_m": 0, "margin_m": margin_m}}}
-    if site.scenario is not None:
-        sections = scene_sections(site.scenario, folder)
-    world = sections.pop("world", {})
-    if site.scenario is None and site.origin.any():
-        world["origin"] = site.origin[:2].tolist()
+def _site_sections(plan: FlightPlan, site: _Site, folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Return the other sections of the scenario, with notes about omitted fields."""
+    if site.scenario is None:
+        reach_m = plan.layout.agl_m * max(plan.scanner.tangent, plan.scanner.ahead)
+        margin_m = max(math.ceil(reach_m * _GROUND_MARGIN), _MIN_MARGIN_M)
+        sections: dict[str, Any] = {"scene": {"ground": {"height_m": 0, "margin_m": margin_m}}}
+        sections |= {"world": {"origin": site.origin[:2].tolist()}} if site.origin.any() else {}
+        sections |= {"cloud": {"columns": _COLUMNS}}
+        omissions: list[str] = []
+    else:
+        sections, omissions = carried_sections(site.scenario, folder, _COLUMNS)
     if site.epsg is not None:
-        world["epsg"] = site.epsg
-    return sections | ({"world": world} if world else {})
+        sections["world"] = sections.get("world", {}) | {"epsg": site.epsg}
+    sections["cloud"] = {"precision_m": 0.001} | sections["cloud"]
+    return sections, omissions
 
 
 def _sensor_sections(plan: FlightPlan, folder: Path) -> dict[str, Any]:
@@ -436,10 +454,10 @@ def _path_text(plan: FlightPlan) -> str:
     return "time_s,x,y,z,yaw_deg,pitch_deg,roll_deg\n" + "".join(lines)
 
 
-def _head(plan: FlightPlan, density: AreaDensity) -> str:
+def _head(plan: FlightPlan, density: AreaDensity, notes: list[str]) -> str:
     """Return the comments at the beginning of the scenario."""
     summary = " ".join(_summary(plan, density))
-    return comment_lines([summary, *(f"Note: {note}." for note in plan.notes)])
+    return comment_lines([summary, *(f"Note: {note}." for note in notes)])
 
 
 def _summary(plan: FlightPlan, density: AreaDensity) -> Iterator[str]:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.words import join_names
+
 if TYPE_CHECKING:
     from ..scenario.prepare import PreparedScenario
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
+
+# Sections of a scenario that a plan replaces.
+_REPLACED = {
+    *("sensor", "sensors", "faults", "mount"),
+    *("poses", "trajectory", "steps", "flight"),
+}
 
 
 def prepared_with_notes(
@@ -37,24 +44,37 @@ def prepared_with_notes(
     return prepared, [*notes, *terminal.warnings]
 
 
-def relative_file(file: Path, folder: Path) -> str:
-    """Return the path of a file relative to the folder of a scenario."""
-    return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+def carried_sections(
+    scenario: Scenario, folder: Path, columns: Sequence[str]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the sections of a scenario that a plan does not replace, for a scenario in a folder.
 
-
-def scene_sections(scenario: Scenario, folder: Path) -> dict[str, Any]:
-    """Return the sections `scene` and `world` of a scenario, for a new scenario in a folder."""
-    entry = scenario.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
-    copies = entry.get("copies", [])
-    named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
-    for file_entry in filter(None, named):
-        file_entry["file"] = relative_file(scenario.path(file_entry["file"]), folder)
-    world = scenario.world.model_dump(exclude_unset=True, mode="json")
-    return {**({"scene": entry} if entry else {}), **({"world": world} if world else {})}
+    `columns` are added to those of the scenario. Returns the sections with notes about actors and
+    faults that are omitted.
+    """
+    content = scenario.content(folder)
+    sections = {name: value for name, value in content.items() if name not in _REPLACED}
+    notes = []
+    platforms = [entry.name for entry in scenario.actors if entry.is_platform]
+    if platforms:
+        actors = [entry for entry in sections["actors"] if entry["name"] not in platforms]
+        sections["actors"] = actors
+        notes.append(
+            f"The actor {join_names(platforms)} is omitted, because the plan replaces the platform"
+        )
+    if scenario.faults:
+        notes.append(
+            "`faults` is omitted, because the plan replaces the sensors and the times of the faults"
+        )
+    cloud = sections.get("cloud", {})
+    sections["cloud"] = cloud | {"columns": [*dict.fromkeys([*cloud.get("columns", ()), *columns])]}
+    return {name: value for name, value in sections.items() if value}, notes
 
 
 def sensor_entry(model: str, folder: Path) -> str:
     """Return a sensor model, or the path of its file relative to the folder of a scenario."""
+    from ..scenario.scenario import relative_file
+
     is_file = model.endswith((".yaml", ".yml"))
     return relative_file(Path(model), folder) if is_file else model
 

@@ -20,11 +20,12 @@ from lidarsim.words import join_names, plural, printable
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
-from .planned_scene import comment_lines, prepared_with_notes, scene_sections, sensor_entry
+from .planned_scene import carried_sections, comment_lines, prepared_with_notes, sensor_entry
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
     from lidarsim.numerics.arrays import Floats
+    from lidarsim.sensor import Sensor
 
     from ..plan.stations import StationPlan, SurveyCoverage
     from ..scenario.prepare import PreparedScenario
@@ -173,8 +174,8 @@ def stations(
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
     else:
         scenario = Scenario.load(scene, of_mesh)
-        model = model or _scenario_model(scenario)
-        if not model:
+        own = scenario.sensor
+        if model is None and own.model is None and own.calibration is None:
             raise click.UsageError(
                 f"`--sensor` is required, because {scene} does not specify a sensor model."
             )
@@ -187,31 +188,27 @@ def stations(
             _plan(scenario, model, folder, **settings)
 
 
-def _scenario_model(scenario: Scenario) -> str | None:
-    model = scenario.sensor.model
-    if model is not None and scenario.sensor.has_custom_model:
-        return str(scenario.path(model))
-    return model
-
-
-def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
+def _plan(
+    scenario: Scenario, model: str | None, folder: Path, as_json: bool, **settings: Any
+) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
-    from lidarsim.schema.model_names import full_name
-    from lidarsim.sensor.models import load_sensor
-
     from ..clouds.folder import staging
     from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
     from .terminal import Terminal
 
-    model = full_name(model)
-    sensor = load_sensor(model)
+    sensor, entry = _planned_sensor(scenario, model, folder)
     sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
     prepared, notes = prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
         plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
-    text = _stations_scenario(scenario, folder, model, plan, settings["targets"], terminal.warnings)
+    sections, omissions = carried_sections(scenario, folder, ["range"])
+    if sections.pop("navigation", None):
+        omissions.append("`navigation` is omitted, because the stations are separate poses")
+    remarks = [f"Warning: {warning}" for warning in terminal.warnings]
+    remarks += [f"Note: {note}." for note in omissions]
+    text = _stations_scenario(sections | {"sensor": entry}, plan, settings["targets"], remarks)
     with (
         explain_os_errors(f"The stations cannot be written to {folder}", "free some disk space"),
         staging(folder) as staged,
@@ -221,7 +218,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
             draw_stations(plan).save(staged / PICTURE_FILE)
         for name in (PLAN_FILE, PICTURE_FILE):
             (staged / name).replace(folder / name)
-    shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
+    shortfalls = [*omissions, *_shortfalls(plan, settings["count"], settings["coverage"])]
     if settings["targets"]:
         shortfalls += _unreachable_notes(prepared.scene.names, plan, "candidate positions")
     else:
@@ -406,30 +403,41 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
         )
 
 
+def _planned_sensor(
+    scenario: Scenario, model: str | None, folder: Path
+) -> tuple[Sensor, dict[str, Any]]:
+    """Return the sensor of a plan, with its section in the planned scenario.
+
+    It is the sensor of the scenario if no model is given. The plan replaces its mount and steps.
+    """
+    from lidarsim.motion.trajectory import CENTER
+    from lidarsim.schema.model_names import full_name
+    from lidarsim.sensor.models import load_sensor
+
+    if model is not None:
+        model = full_name(model)
+        return load_sensor(model), {"model": sensor_entry(model, folder)}
+    section = scenario.sensor
+    mounted = section.mounted_sensor(scenario.path, CENTER, scenario.noise, scenario.returns)
+    entry = scenario.content(folder)["sensor"]
+    entry.pop("step_deg", None)
+    return mounted.sensor, entry
+
+
 def _stations_scenario(
-    scenario: Scenario,
-    folder: Path,
-    model: str,
-    plan: StationPlan,
-    targets: Sequence[str],
-    warnings: Sequence[str],
+    sections: dict[str, Any], plan: StationPlan, targets: Sequence[str], remarks: Sequence[str]
 ) -> str:
-    """Return the text of a scenario file with stations as poses and warnings as comments."""
+    """Return the text of a scenario file with stations as poses and remarks as comments."""
     import yaml
 
-    data = {
-        **scene_sections(scenario, folder),
-        "sensor": {"model": sensor_entry(model, folder)},
-        "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
-        "steps": 36,
-        "cloud": {"columns": ["range"]},
-    }
+    poses = [[round(float(part), 3) for part in position] for position in plan.stations]
+    data = sections | {"poses": poses, "steps": 36}
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
         f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_target_phrase(targets)}. "
         "Each station scans one revolution in steps of 10 degrees.\n"
     )
-    head += comment_lines([f"Warning: {warning}" for warning in warnings])
+    head += comment_lines(remarks)
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 

@@ -456,6 +456,7 @@ class _Building:
             figures=figures,
             pictures=pictures,
             actors=actors,
+            classes=recorded.recording.classes,
         )
 
     def _scene(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -75,6 +75,8 @@ class Twin:
         Charts of the report by name.
     actors
         Moving objects of the recording.
+    classes
+        Names of the semantic classes by number, as far as the recording states them.
     """
 
     scene: Scene
@@ -87,6 +89,7 @@ class Twin:
     figures: dict[str, Any]
     pictures: dict[str, Any]
     actors: Sequence[RecordedActor] = ()
+    classes: Mapping[int, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return render_template("twin.txt", report=self.figures).rstrip("\n")
@@ -189,6 +192,9 @@ class Twin:
         if self.actors:
             scenario["classes"] |= class_names(self.actors)
             scenario["actors"] = [actor.section() for actor in self.actors]
+        scenario["classes"] |= {
+            number: self.classes[number] for number in scenario["classes"] if number in self.classes
+        }
         scenario["cloud"] = {"columns": _COLUMNS}
         head = (
             f"# Reconstruction of {self.figures['name']}, created by lidarpool "

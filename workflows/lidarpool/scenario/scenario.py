@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -25,7 +26,7 @@ from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.schema.declared import Several, Text, about, accept_text
 from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import FieldPath, fields_of, format_path, is_section
-from lidarsim.sensor.models import plugin_model_file
+from lidarsim.sensor.models import MODEL_FILES, plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
@@ -49,6 +50,7 @@ from .sections import (
 from .traffic import TrafficSection
 
 _FILE_FIELDS = {"file", "calibration", "model", "times"}  # fields that contain file names
+_PATH_FIELDS = _FILE_FIELDS | {"assets"}  # fields that contain names of files or folders
 
 # Options for simulating a mesh file without a scenario, and the corresponding scenario fields.
 MESH_OPTIONS = {
@@ -59,6 +61,11 @@ MESH_OPTIONS = {
     "columns": "cloud.columns",
     "format": "output.write",
 }
+
+
+def relative_file(file: Path, folder: Path) -> str:
+    """Return the path of a file relative to the folder of a scenario."""
+    return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
 
 def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -430,6 +437,16 @@ class Scenario(Section):
                 paths += list_trajectory_files(self.path(trajectory.file))
         return tuple(dict.fromkeys(paths))
 
+    def content(self, folder: Path) -> dict[str, Any]:
+        """Return the sections that the scenario states, for a scenario file in another folder.
+
+        Names of files are relative to the folder. The result can be written as YAML.
+        """
+        return {
+            name: _plain_data(value, lambda text: relative_file(self.path(text), folder))
+            for name, value in _stated_fields(self)
+        }
+
     def message_prefix(self, file: Path) -> str:
         """Return a message prefix with the scenario and the field in which a file is named.
 
@@ -504,6 +521,43 @@ def _is_contradictory(content: Any) -> bool:
         return any(Scenario.model_validate(content)._contradictions())
     except ValidationError:  # the content has another error
         return False
+
+
+def _stated_fields(section: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the fields that a section states, with their names in files.
+
+    Models record which fields are set. A field of a dataclass is stated if its value is not the
+    default.
+    """
+    stated = getattr(section, "model_fields_set", None)
+    for name, field in fields_of(type(section)).items():
+        value = getattr(section, name)
+        default = field.get_default(call_default_factory=True)
+        if value != default if stated is None else name in stated:
+            yield field.alias or name, value
+
+
+def _plain_data(value: Any, relative: Callable[[str], str]) -> Any:
+    """Convert the value of a field to the types of YAML.
+
+    `relative` converts the names of files.
+    """
+    if is_section(type(value)):
+        return {
+            name: relative(field) if _names_file(name, field) else _plain_data(field, relative)
+            for name, field in _stated_fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {name: _plain_data(entry, relative) for name, entry in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain_data(entry, relative) for entry in value]
+    return value.isoformat() if isinstance(value, datetime) else value
+
+
+def _names_file(name: str, value: Any) -> bool:
+    """Return whether the value of a field is the name of a file or folder."""
+    is_path = name in _PATH_FIELDS and isinstance(value, str)
+    return is_path and (name != "model" or value.endswith(MODEL_FILES))
 
 
 def _find_file_field(section: Any, is_file: Callable[[str], bool]) -> str:

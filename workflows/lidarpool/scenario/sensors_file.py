@@ -25,7 +25,8 @@ from .sections import NoiseSection, ReturnsSection, Section, SensorSection, allo
 
 # Fields that describe a survey, which a program that follows another simulator does not have.
 _SURVEY_FIELDS = {"steps"}
-_SCENARIO_FIELDS = ("poses", "trajectory")  # fields of a scenario that move the sensors
+# Fields of a scenario that move the sensors or change their measurements, but are not used.
+_SCENARIO_FIELDS = ("poses", "trajectory", "steps", "navigation", "faults")
 _CLOUD_FIELDS = {"columns", "precision_m"}
 
 
@@ -105,9 +106,9 @@ class SensorsFile(Section):
         file = cls().model_copy(update={name: getattr(scenario, name) for name in names})
         file._folder = scenario.path("")
         file._source = scenario.source
-        moved = [name for name in _SCENARIO_FIELDS if name in scenario.model_fields_set]
+        fields = [name for name in _SCENARIO_FIELDS if name in scenario.model_fields_set]
         cloud = [f"cloud.{name}" for name in _unsupported_options(file.cloud)]
-        file._unused = (*moved, *cloud)
+        file._unused = (*fields, *cloud)
         return file
 
     @property

@@ -292,10 +292,9 @@ def load_served_scene(
 
 def _unused_fields(scenario: Scenario) -> Iterator[str]:
     """Yield a note about the fields of a scenario that would change points, but are not used."""
-    names = [
-        name for name in SensorsFile.from_scenario(scenario).unused if name.startswith("cloud.")
-    ]
-    names += ["faults"] if scenario.faults else []
+    unused = SensorsFile.from_scenario(scenario).unused
+    # Requests contain the poses and times of the sensor.
+    names = [name for name in unused if name not in ("poses", "trajectory", "steps")]
     if names:
         yield f"{scenario.source}: These fields are not used: {', '.join(names)}."
 
