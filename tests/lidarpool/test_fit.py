@@ -581,8 +581,11 @@ def test_broken_files_are_told_in_a_line(tmp_path, name):
     assert name in str(raised.value) and len(str(raised.value).splitlines()) == 1
 
 
-def round_room():
-    """Return times and packets of a VLP-16 in the middle of a round room of 5 m."""
+def round_room(first_us=0):
+    """Return times and packets of a VLP-16 in the middle of a round room of 5 m.
+
+    The first packet is sent at `first_us` past the hour.
+    """
     blocks = 12
     for number in range(76 * 4):
         data = b""
@@ -590,7 +593,8 @@ def round_room():
             azimuth = round((number * blocks + block) * 39.8133) % 36000
             data += struct.pack("<HH", 0xEEFF, azimuth) + struct.pack("<HB", 2500, 50) * 32
         micros = round(number * blocks * 110.592)
-        yield 1000 * micros, data + struct.pack("<IBB", micros, 0x37, 0x22)
+        stamp_us = (first_us + micros) % 3_600_000_000
+        yield 1000 * micros, data + struct.pack("<IBB", stamp_us, 0x37, 0x22)
 
 
 def test_packets_of_a_velodyne_are_sweeps(tmp_path):
@@ -624,6 +628,74 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
         for address in ("192.168.1.201", "10.0.0.7")
     ]
     assert counts == [opened.count, 2]
+
+
+def rearranged(packets, order):
+    """Return packets in another order. Their capture times stay ascending."""
+    times = sorted(packets[row][0] for row in order)
+    return [(time_ns, packets[row][1]) for time_ns, row in zip(times, order, strict=True)]
+
+
+def swapped(row):
+    """Return the order of packets of which two neighbors, the first of them `row`, are swapped."""
+    order = [*range(76 * 4)]
+    order[row : row + 2] = row + 1, row
+    return order
+
+
+LATE_BY_10 = [*range(100), *range(101, 111), 100, *range(111, 76 * 4)]
+FAR = [*range(100), *range(101, 131), 100, *range(131, 76 * 4)]  # 30 packets late: not sorted
+
+
+@pytest.mark.parametrize(
+    ("order", "first_us", "notes"),
+    [
+        (swapped(100), 0, ["1 packet in the wrong order"]),
+        (swapped(75), 0, ["1 packet in the wrong order"]),  # a sweep begins between them
+        (swapped(0), 0, ["1 packet in the wrong order"]),
+        (swapped(76 * 4 - 2), 0, ["1 packet in the wrong order"]),
+        (swapped(150), 3_599_999_999 - 150 * 1327, ["1 packet in the wrong order"]),  # a new hour
+        (LATE_BY_10, 0, ["1 packet in the wrong order"]),
+        (np.repeat(range(76 * 4), 2), 0, ["304 repeated packets"]),
+        (np.repeat(swapped(100), 2), 0, ["1 packet in the wrong order", "304 repeated packets"]),
+        (range(76 * 4), 0, []),
+        (range(76 * 4), 3_599_999_999 - 150 * 1327, []),
+    ],
+)
+def test_packets_of_a_velodyne_are_sorted(tmp_path, order, first_us, notes):
+    pytest.importorskip("velodyne_decoder")
+    packets = [*round_room(first_us)]
+    path = tmp_path / "room.pcap"
+
+    def read(frames):
+        path.write_bytes(pcap((time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in frames))
+        return open_recording(path)
+
+    plain = read(packets)
+    sweeps = [sweep.points for sweep in plain]
+    times_s = [sweep.columns["time"] for sweep in plain]
+    found = read(rearranged(packets, order))
+    assert len(found) == len(sweeps) >= 4
+    for number, sweep in enumerate(found):
+        np.testing.assert_array_equal(sweep.points, sweeps[number])
+        np.testing.assert_allclose(sweep.columns["time"], times_s[number], atol=2e-6)
+    np.testing.assert_allclose(found.stamps_ns, plain.stamps_ns, atol=2e6)
+    assert len(found.notes) == len(notes)
+    assert all(words in note for words, note in zip(notes, found.notes, strict=True))
+
+
+def test_a_velodyne_whose_clock_is_set_back_keeps_its_packets(tmp_path):
+    """A repeated revolution, and packets that are too late, are no repeated packets."""
+    pytest.importorskip("velodyne_decoder")
+    packets = [*round_room()]
+    for order in ([*range(200), *range(124, 76 * 4)], FAR):
+        frames = [
+            (time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in rearranged(packets, order)
+        ]
+        (tmp_path / "room.pcap").write_bytes(pcap(frames))
+        recording = open_recording(tmp_path / "room.pcap")
+        assert sum(map(len, recording)) == len(order) * 12 * 32
+        assert [*recording.notes] == []
 
 
 def hdl64e(model, lasers=range(64)):

@@ -19,6 +19,7 @@ from ..environment.extras import require_package
 from ..numerics.arrays import AnyArray, Ints
 from .capture import Capture, CapturedDatagram
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
+from .packet_order import PacketOrder, order_notes
 from .service import Destination, Service
 from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
@@ -168,11 +169,13 @@ class VelodyneDecoder(PacketDecoder):
         super().__init__(path, name)
         require_package("velodyne_decoder", "fit", f"Reading {name}")
         self._capture = Capture(path, name)
-        units = dict.fromkeys(map(_unit_of, self._packets()))
-        self._units = [*units]
-        self.notes = self._capture.notes
-        if len(units) > 1:
-            self.sensors = [f"{address}:{port}" for address, port in units]
+        orders: dict[tuple[str, int], PacketOrder] = {}
+        for packet in self._captured():
+            orders.setdefault(_unit_of(packet), _new_order()).add(packet)
+        self._units = [*orders]
+        self.notes = [*self._capture.notes, *order_notes(orders.values())]
+        if len(orders) > 1:
+            self.sensors = [f"{address}:{port}" for address, port in orders]
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
@@ -205,17 +208,20 @@ class VelodyneDecoder(PacketDecoder):
         """Return the time at which the receiver got the first packet of the sweep."""
         return float(1e9 * sweep.stamp.host)
 
-    def _packets(self, sensor: int | None = None) -> Iterator[CapturedDatagram]:
-        """Yield the data packets of one sensor, or of all sensors."""
-        for datagram in self._capture.datagrams():
-            is_wanted = sensor is None or _unit_of(datagram) == self._units[sensor]
-            if is_wanted and self.recognizes(datagram.payload):
-                yield datagram
+    def _captured(self) -> Iterator[CapturedDatagram]:
+        """Yield the data packets of all sensors in the order of the file."""
+        return (packet for packet in self._capture.datagrams() if self.recognizes(packet.payload))
+
+    def _packets(self, sensor: int) -> Iterator[CapturedDatagram]:
+        """Yield the data packets of a sensor in the order in which they were sent."""
+        order = _new_order()
+        for packet in self._captured():
+            if _unit_of(packet) == self._units[sensor]:
+                yield from order.add(packet)
+        yield from order.finish()
 
     def _is_hdl64e(self, sensor: int) -> bool:
         """Return whether a sensor is an HDL-64E, whose packets end with two varying bytes.
-
-        The bytes transmit the state of the sensor.
 
         The bytes transmit the state of the sensor.
         """
@@ -242,6 +248,16 @@ class _Sweep(NamedTuple):
 
     stamp: Any  # has the times `host` and `device` in seconds
     points: AnyArray  # structured
+
+
+def _new_order() -> PacketOrder:
+    return PacketOrder(_stamp_us, _HOUR_US)
+
+
+def _stamp_us(payload: bytes) -> int:
+    """Return the timestamp of a data packet in µs past the hour."""
+    start = _PACKET.fields["stamp_us"][1]  # type: ignore[index]
+    return int.from_bytes(payload[start : start + 4], "little")
 
 
 def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
