@@ -1,5 +1,6 @@
 """Tasks take slots of their partition at any depth, and lend their own while they wait."""
 
+import concurrent.futures
 import logging
 import os
 import pickle
@@ -20,6 +21,8 @@ from distributed import (
     Variable,
     as_completed,
     get_client,
+    rejoin,
+    secede,
     wait,
     worker_client,
 )
@@ -229,6 +232,47 @@ def test_what_holds_a_resource_that_is_no_partition_lends_nothing(start):
     Event("lending-r", client).set()
     with pytest.raises(TimeoutError):
         client.submit(hold, "lending-r", resources={"R": 1}).result(LONG_S)
+
+
+def secede_and_gather(depth, gate=None):
+    """Wait for nested tasks like joblib: away from the threads, submitting in the event loop."""
+    client = get_client()
+    if not depth:
+        time.sleep(0.01)
+        return [worker_name()]
+    found = []
+    for _ in range(2):  # a task that has rejoined secedes again
+        answer = concurrent.futures.Future()
+
+        async def submit(answer=answer):
+            futures = [client.submit(secede_and_gather, depth - 1, pure=False) for _ in range(3)]
+            answer.set_result(await client.gather(futures, asynchronous=True))
+
+        client.loop.add_callback(submit)
+        secede()
+        found += [name for names in answer.result(LONG_S) for name in names]
+        rejoin()
+    if gate:
+        assert Event(gate, client).wait(LONG_S)
+    return found
+
+
+@pytest.mark.parametrize(("slots", "by_client"), [(1, True), (2, False)])
+def test_nested_tasks_of_tasks_that_secede(start, wait_until, slots, by_client):
+    client = start({"a": {"nthreads": slots}, "other": {"nthreads": 4}})
+    part, _ = Pool.from_client(client).partition("A", workers=["a"], slots=slots)
+    submit = part.as_client().submit if by_client else part.submit
+    options = {"pure": False} if by_client else {}
+    gate = f"seceded-{slots}-{by_client}"
+    together = [submit(secede_and_gather, depth, **options) for depth in (2, 1)]
+    assert client.gather(together) == [["a"] * 36, ["a"] * 6]
+    wait_until(lambda: slots_there(part) == [slots])
+    future = submit(secede_and_gather, 1, gate, **options)
+    wait_until(lambda: part.stats().stages["secede_and_gather"].done == 56)
+    wait_until(lambda: slots_there(part) == [slots - 1])  # holds its slot again
+    Event(gate, client).set()
+    assert future.result(LONG_S) == ["a"] * 6
+    wait_until(lambda: slots_there(part) == [slots])
 
 
 # -- workers that were started with a partition ------------------------------------------

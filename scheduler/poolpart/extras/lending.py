@@ -11,12 +11,14 @@ tasks need. Therefore, while it waits, other tasks can use its slots and its wor
   partition has submitted, or a task that waits to get its own slots or thread back. On a worker
   without nested tasks, a long-running task keeps its slots. Therefore, a producer and a consumer
   that a client has submitted need one slot each.
+- A task that has left the worker's thread pool with `distributed.secede`, as nested calls of joblib
+  do, lends its slots in the same cases, until it rejoins the pool or ends.
 
-A loan lasts until the end of the wait. The task then gets its slots and thread back before it
-continues, even if the wait has timed out. From the end of the wait until then, no other task can
-start in these slots. If several tasks on a worker wait for their slots, they get them back in the
-order in which their waits ended. Do not hold a `threading.Lock` during a wait, because a task that
-borrows the slot may try to acquire it.
+The loan of a waiting task lasts until the end of the wait. The task then gets its slots and thread
+back before it continues, even if the wait has timed out. From the end of the wait until then, no
+other task can start in these slots. If several tasks on a worker wait for their slots, they get
+them back in the order in which their waits ended. Do not hold a `threading.Lock` during a wait,
+because a task that borrows the slot may try to acquire it.
 
 A task that waits in another way, for example by calling `Future.done` in a loop, does not lend its
 slots. If a task that it has submitted waits for slots in the meantime, all clients receive a
@@ -57,6 +59,8 @@ from ..internals.worker import (
     release_slots,
     reserve_slots,
     resources_of,
+    seceded_tasks,
+    set_resources_to_release,
     submitter_of,
     threads_of,
 )
@@ -65,6 +69,7 @@ logger = logging.getLogger(__name__)
 
 WARN_AFTER_S = 5.0  # time that a nested task waits for slots before clients are warned
 _CHECK_EVERY_S = 1.0  # interval between checks whether the worker still exists
+_SECEDED_EVERY_S = 0.2  # interval between checks for tasks that have left or rejoined the threads
 _ENDING = (Status.closing, Status.closed, Status.failed)
 
 _lock = threading.Lock()
@@ -101,6 +106,9 @@ class Lender:
         self._returning: deque[_Loan] = deque()  # loans whose tasks wait to get their slots back
         self._rejoining: set[Any] = set()  # keys of tasks that wait for a thread of the worker
         self._lent: set[Any] = set()  # keys of running tasks that have lent their slots before
+        self.lending: set[Any] = set()  # keys of tasks in a `lend` block
+        self._seceded: dict[Any, Resources] = {}  # {key of a seceded task: slots that it has lent}
+        self._updates_soon = False  # whether an update of `_seceded` is scheduled
         self._warned: set[Any] = set()  # keys of submitting tasks with a warning
         self._next_check: Any = None  # timer handle of the next check
 
@@ -154,6 +162,32 @@ class Lender:
                 return False
         return True
 
+    def update_seceded(self) -> None:
+        """Let seceded tasks lend their slots on demand, and take slots back from the others.
+
+        A task that has rejoined continues immediately, so its slots are reserved even if they are
+        in use.
+        """
+        self._updates_soon = False
+        seceded = {task.key: task for task in seceded_tasks(self.worker)}
+        for key in self._seceded.keys() - seceded.keys():
+            slots = self._seceded.pop(key)
+            task = self.worker.state.tasks.get(key)
+            if is_running(self.worker, key):  # otherwise, Dask has released the other resources
+                slots = {n: s for n, s in slots.items() if count_slots(self.worker, n)[1]}
+                set_resources_to_release(task, {**task.resource_restrictions, **slots})
+                reserve_slots(self.worker, slots)
+        if not self.has_slot_requests():
+            return
+        for key in seceded.keys() - self._seceded.keys() - self.lending:
+            task = seceded[key]
+            slots = {name: n for name, n in resources_of(task).items() if name in self.names}
+            if slots:
+                others = {n: s for n, s in task.resource_restrictions.items() if n not in slots}
+                set_resources_to_release(task, others)
+                self._seceded[key] = slots
+                release_slots(self.worker, slots)
+
     # -- demand for slots --------------------------------------------------------------
 
     def has_slot_requests(self) -> bool:
@@ -177,6 +211,9 @@ class Lender:
         if self.has_slot_requests():
             for waiter in tuple(self.waiters):
                 waiter.set()
+        if (self._seceded or self.has_slot_requests()) and not self._updates_soon:
+            self._updates_soon = True  # not now, because Dask may be in the middle of a transition
+            self.worker.loop.add_callback(self.update_seceded)
 
     def transition(self, key: Any, finish: str) -> None:
         """Track the state of a task, because tasks in the state "constrained" wait for slots."""
@@ -201,11 +238,17 @@ class Lender:
     def _schedule_check(self) -> None:
         """Schedule the next check for tasks that have waited too long."""
         loop = asyncio.get_running_loop()
-        self._next_check = loop.call_later(WARN_AFTER_S / 2, self._check_nested)
+        seconds = min(WARN_AFTER_S / 2, _SECEDED_EVERY_S)
+        self._next_check = loop.call_later(seconds, self._check_nested)
 
     def _check_nested(self) -> None:
-        """For each task that has waited too long, check whether its submitter occupies slots."""
+        """For each task that has waited too long, check whether its submitter occupies slots.
+
+        A task that secedes again, or rejoins, changes no state of the worker, so this is checked as
+        well.
+        """
         self._next_check = None
+        self.update_seceded()
         looked_at = time.monotonic()
         for key, nested in self._nested.items():
             if (
@@ -214,15 +257,16 @@ class Lender:
             ):
                 self._warned.add(nested.submitter.key)
                 self.worker.loop.add_callback(self._warn, key, nested.submitter)
-        if self._nested:
+        if (self._nested or self._seceded) and self._next_check is None:
             self._schedule_check()
-        else:
+        if not self._nested:
             self._warned.clear()
 
     def holds_slots(self, key: Any) -> bool:
         """Return whether a task is running on this worker and has not lent its slots."""
         waits = any(loan.key == key for loan in self._returning)
-        return is_running(self.worker, key) and not (self._loans[key] or waits)
+        lends = self._loans[key] or key in self._seceded or waits
+        return is_running(self.worker, key) and not lends
 
     async def _warn(self, key: Any, submitter: SubmittingTask) -> None:
         """Warn all clients if the submitter of a waiting task occupies slots on some worker."""
@@ -308,6 +352,7 @@ class _WaitHooks:
         lender, loan = loan_of_task
         worker = lender.worker
         _thread.in_loan = True
+        lender.lending.add(loan.key)  # before the thread leaves, which `update_seceded` detects
         has_thread = False
         # After `worker_client`, or in a custom executor, the task does not occupy a worker thread.
         with suppress(KeyError, AttributeError):
@@ -328,6 +373,7 @@ class _WaitHooks:
                 worker.loop.add_callback(lender.begin_rejoin, loan.key)
                 rejoin()
                 worker.loop.add_callback(lender.end_rejoin, loan.key)
+            lender.lending.discard(loan.key)
 
 
 WAIT_HOOKS = _WaitHooks()

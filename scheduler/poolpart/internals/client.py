@@ -105,16 +105,19 @@ _submitter: ContextVar[Any] = ContextVar("_submitter", default=None)  # key of a
 
 @cache  # only once per process, like `install_wait_hooks`
 def name_submitter_in_coroutines() -> None:
-    """Make coroutines that a task runs with `Client.sync` submit tasks on behalf of the task.
+    """Make coroutines that a task starts in the event loop submit tasks on behalf of the task.
 
     Dask sends the key of the submitting task, but looks it up in the state of the thread. Libraries
-    such as xgboost submit in coroutines, which run in the thread of the event loop. A coroutine
-    inherits the context variables of the thread that has started it.
+    such as xgboost and joblib submit in coroutines, which run in the thread of the event loop. A
+    coroutine inherits the context variables of the thread that has started it, either with
+    `Client.sync` or, after `get_client`, in any other way. Each task has its own context.
     """
+    from distributed import Worker
     from distributed.utils import SyncMethodMixin
 
     sync = SyncMethodMixin.sync
     send = Client._send_to_scheduler
+    get_client = Worker._get_client
 
     @wraps(sync)
     def sync_for_task(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
@@ -127,8 +130,16 @@ def name_submitter_in_coroutines() -> None:
             message["submitting_task"] = _submitter.get()
         send(client, message)
 
+    @wraps(get_client)
+    def get_client_for_task(worker: Any, *args: Any, **kwargs: Any) -> Client:
+        client: Client = get_client(worker, *args, **kwargs)
+        if (key := _key_of_thread()) is not None:
+            _submitter.set(key)
+        return client
+
     SyncMethodMixin.sync = sync_for_task
     Client._send_to_scheduler = send_for_task
+    Worker._get_client = get_client_for_task
 
 
 def _key_of_thread() -> Any:

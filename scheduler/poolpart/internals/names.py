@@ -111,9 +111,28 @@ PRIVATE_NAMES = (
     ),
     PrivateNames(
         NESTED,
-        ("distributed.client:Client._send_to_scheduler(msg)",),
+        (
+            "distributed.client:Client._send_to_scheduler(msg)",
+            "distributed.worker:Worker._get_client(timeout)",
+        ),
         "name the submitting task in coroutines; wrapped once per process and never restored",
-        ("test_inherit.py::test_tasks_that_a_coroutine_of_the_task_submits",),
+        (
+            "test_inherit.py::test_tasks_that_a_coroutine_of_the_task_submits",
+            "test_lending.py::test_nested_tasks_of_tasks_that_secede",
+        ),
+    ),
+    PrivateNames(
+        NESTED,
+        (
+            "distributed.worker:Worker.active_threads",
+            "distributed.worker:Worker.active_threads_lock",
+            "distributed.worker:Worker.executor",
+            "distributed.threadpoolexecutor:ThreadPoolExecutor._threads",
+            f"{_WORKER_STATE}.long_running",
+            f"{_WORKER_TASK}.resource_restrictions",
+        ),
+        "a task that has seceded lends its slots until it rejoins",
+        ("test_lending.py::test_nested_tasks_of_tasks_that_secede",),
     ),
     PrivateNames(
         EXISTING,

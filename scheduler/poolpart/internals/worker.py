@@ -109,6 +109,23 @@ def is_running(worker: Any, key: Any) -> bool:
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
+def seceded_tasks(worker: Any) -> list[Any]:
+    """Return the tasks whose threads have left the worker's thread pool and not rejoined it.
+
+    Dask counts a task that has rejoined as long-running, so only its thread shows the difference.
+    """
+    pool = {thread.ident for thread in getattr(worker.executor, "_threads", set()).copy()}
+    with worker.active_threads_lock:
+        keys = [key for thread, key in worker.active_threads.items() if thread not in pool]
+    tasks = (worker.state.tasks.get(key) for key in keys)
+    return [task for task in tasks if task in worker.state.long_running]
+
+
+def set_resources_to_release(task: Any, resources: Resources) -> None:
+    """Set the resources that a running task occupies, and that Dask releases when it ends."""
+    task.resource_restrictions = resources  # not changed in place, because others may share it
+
+
 def release_slots(worker: Any, slots: Resources) -> None:
     """Make slots available to a worker's waiting tasks. Runs in the worker's event loop."""
     from distributed.worker_state_machine import UnpauseEvent
