@@ -133,8 +133,9 @@ def test_options_of_each_insertion_follow_it(captured):
         captured,
         *("--insert", "car", "--at", "12,3"),
         *("--insert", "pedestrian", "--heading", 90, "--at=-5,1,-1.5", "--class", "person"),
-        *("--insert", "car", "--at", "1,2", "--heading", -45),
+        *("--insert", "car", "--at", "1,2", "--heading", -45, "--name", "taxi"),
     )
+    assert [insertion.name for insertion in effects.insertions] == ["", "", "taxi"]
     car, person, other = effects.insertions
     assert (car.mesh.name, car.x_m, car.y_m, car.z_m) == ("car", 12, 3, None)
     assert (car.heading_deg, car.class_name) == (0, "car")
@@ -190,6 +191,8 @@ def test_resampling_requires_no_effects(captured):
             ["--insert", "car", "--at", "1,2", "--at", "3,4"],
             "`--at` occurs twice for `--insert car`",
         ),
+        (["--name", "Anna"], "`--name` must follow the `--insert` of the object"),
+        (["--class", "car"], "`--class` must follow the `--insert` of the object"),
         (["--insert", "car", "--at", "1"], "'1' is not a position. Expected X,Y or X,Y,Z"),
         (["--insert", "cart", "--at", "1,2"], "There is no object 'cart' to insert. Did you mean"),
         (["--insert", "no.glb", "--at", "1,2"], "no.glb does not exist"),

@@ -9,6 +9,8 @@ import pytest
 from lidarpool import Fault, Pose, Scanner, Scene, Track, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects, Insertion
+from lidarpool.augmentation.insertions import load_insertion
+from lidarpool.augmentation.object_classes import find_class
 from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
@@ -436,6 +438,67 @@ def test_classes_have_the_numbers_of_the_recording(clear, sensor):
     unnamed = replace(clear, read=read)
     notes = Augmenter(unnamed, car, sensor).notes
     assert any("does not state the numbers of its classes" in note for note in notes)
+
+
+SEMANTIC_KITTI = {10: "car", 30: "person", 31: "bicyclist", 252: "moving-car", 254: "moving-person"}
+LIDARSEG = {2: "human.pedestrian.adult", 17: "vehicle.car", 18: "vehicle.emergency.police"}
+
+
+@pytest.mark.parametrize(
+    ("names", "kind", "expected"),
+    [
+        (SEMANTIC_KITTI, "pedestrian", "person"),
+        (SEMANTIC_KITTI, "cyclist", "bicyclist"),
+        (SEMANTIC_KITTI, "Car", "car"),
+        (SEMANTIC_KITTI, "moving_person", "moving-person"),
+        (LIDARSEG, "person", "human.pedestrian.adult"),
+        (LIDARSEG, "car", "vehicle.car"),
+        (LIDARSEG, "police", "vehicle.emergency.police"),
+        ({1: "Pedestrian", 2: "person"}, "person", "person"),
+        ({1: "Pedestrian", 2: "person"}, "pedestrian", "Pedestrian"),
+        ({1: "Walker"}, "human", "Walker"),
+        (SEMANTIC_KITTI, "boat", None),
+        (LIDARSEG, "adult", "human.pedestrian.adult"),
+    ],
+)
+def test_classes_of_data_sets_have_synonyms(names, kind, expected):
+    assert find_class(kind, names.values()) == expected
+
+
+def test_objects_of_the_same_shape_are_numbered(clear, sensor):
+    """Two pedestrians, a third with a name, and an actor whose name the second would have."""
+
+    def read(number):
+        sweep = clear.read(number)
+        return sweep.replace(columns={**sweep.columns, "class": np.zeros(len(sweep), np.uint16)})
+
+    named = replace(clear, read=read, read_classes=lambda: SEMANTIC_KITTI)
+    places = [(6.0, -3.0), (7.0, 4.0), (-5.0, 5.0)]
+    people = tuple(
+        Insertion(load_insertion("pedestrian"), x, y, class_name="pedestrian", name=name)
+        for (x, y), name in zip(places, ("", "", "Anna"), strict=True)
+    )
+    track = Track([0, 1], [[-10, 3, 0.7], [10, 3, 0.7]])
+    actor = Actor(replace(CAR, name="pedestrian_2"), track)
+    augmenter = Augmenter(named, Effects(insertions=people, actors=(actor,)), sensor)
+    assert augmenter.objects.names == ("pedestrian", "pedestrian_3", "Anna", "pedestrian_2")
+    assert augmenter.objects.types[:3] == ("pedestrian",) * 3
+    result = augmenter.sweep(0)
+    added = ~result.is_recorded
+    points, objects = result.sweep.points[added], result.sweep.columns["object"][added]
+    numbers = np.unique(objects)[:3]
+    for number, (x, y) in zip(numbers, places, strict=True):
+        distance = np.hypot(*(points[objects == number, :2] - [x, y]).T)
+        assert len(distance) > 10 and distance.max() < 0.6
+    is_person = np.isin(objects, numbers)
+    assert {*result.sweep.columns["class"][added][is_person].tolist()} == {30}
+
+
+def test_actors_of_the_same_name_are_refused(clear, sensor):
+    track = Track([0, 1], [[-10, 3, 0.7], [10, 3, 0.7]])
+    actor = Actor(replace(CAR, name="Moving"), track)
+    with pytest.raises(LidarError, match="Two inserted objects are named 'Moving'"):
+        Augmenter(clear, Effects(actors=(actor, actor)), sensor)
 
 
 def test_sweeps_of_different_sensors_are_refused(scene, sensor):

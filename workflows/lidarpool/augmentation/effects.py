@@ -35,7 +35,7 @@ class Insertion:
     Attributes
     ----------
     mesh
-        Mesh of the object, with z up and x forward. Its name is the name of the object.
+        Mesh of the object, with z up and x forward.
     x_m, y_m
         Position in the sensor frame of the first sweep, in meters.
     z_m
@@ -44,7 +44,11 @@ class Insertion:
     heading_deg
         Heading in degrees, counterclockwise from the x axis of the sensor.
     class_name
-        Semantic class of the object, or an empty string.
+        Semantic class of the object, or an empty string. Names that data sets use for the same
+        class, such as "person" and "pedestrian", are equivalent.
+    name
+        Name of the object, by which materials select it. The default is the name of the mesh. If
+        several objects have the same name, numbers are appended, as in "car_2".
     """
 
     mesh: SceneMesh
@@ -53,6 +57,7 @@ class Insertion:
     z_m: float | None = None
     heading_deg: float = 0.0
     class_name: str = ""
+    name: str = ""
 
     __repr__ = one_line
 

@@ -19,12 +19,13 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
 from lidarsim.simulator.returns import PulseReturns
-from lidarsim.words import did_you_mean, join_names, plural
+from lidarsim.words import did_you_mean, join_names, make_distinct, plural
 
 from ..clouds.boxes import SweepBoxes
 from ..clouds.recording import Recording
 from .effects import Effects, Insertion
 from .ground_plane import GroundPlane
+from .object_classes import find_class
 from .sensor_motion import SensorMotion, SweepMotion
 
 _FIRST_OBJECT = 60_000  # number of the first inserted object if the objects have no names
@@ -68,7 +69,8 @@ class InsertedObjects:
         Raises
         ------
         LidarError
-            If two objects have the same name, or the recorded ground below an object is unknown.
+            If two actors have the same name, if the class of an object is unknown, or if the
+            recorded ground below an object is unknown.
         """
         if not effects.actors and not effects.insertions:
             return cls(scene_of_bodies(), materials=effects.materials)
@@ -80,21 +82,19 @@ class InsertedObjects:
             )
         first_pose = np.eye(4) if motion.poses is None else motion.poses[0]
         ground = GroundPlane.from_sweep(recording[0]) if effects.insertions else None
+        names = _names(effects)
         meshes: list[SceneMesh] = []
         placed: dict[int, Floats] = {}
         sensor_positions = np.zeros((1, 3)) if motion.poses is None else motion.poses[:, :3, 3]
         for number, insertion in enumerate(effects.insertions):
             assert ground is not None
-            pose = first_pose @ _sensor_pose(insertion, ground, recording.name)
+            mesh = replace(insertion.mesh, name=names[number], animation=None)
+            pose = first_pose @ _sensor_pose(insertion, mesh, ground, recording.name)
             placed[number] = pose
-            notes += _position_notes(insertion.mesh, pose, sensor_positions)
-            vertices = insertion.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-            meshes.append(replace(insertion.mesh, vertices=vertices, animation=None))
+            notes += _position_notes(mesh, pose, sensor_positions)
+            vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+            meshes.append(replace(mesh, vertices=vertices))
         actors = tuple(_shifted(actor, motion.shift) for actor in effects.actors)
-        names = [mesh.name for mesh in meshes] + [actor.name for actor in actors]
-        for name in names:
-            if names.count(name) > 1:
-                raise LidarError(f"Two inserted objects are named {name!r}. Rename one of them.")
         types = [
             insertion.class_name or _type(insertion.mesh.name) for insertion in effects.insertions
         ]
@@ -231,15 +231,29 @@ def _boxes(
     )
 
 
-def _sensor_pose(insertion: Insertion, ground: GroundPlane, name: str) -> Floats:
+def _names(effects: Effects) -> list[str]:
+    """Return the distinct names of the insertions and the actors.
+
+    Raises LidarError if two actors have the same name.
+    """
+    actors = [actor.name for actor in effects.actors]
+    for name in actors:
+        if actors.count(name) > 1:
+            raise LidarError(f"Two inserted objects are named {name!r}. Rename one of them.")
+    insertions = [insertion.name or insertion.mesh.name for insertion in effects.insertions]
+    distinct = make_distinct([*actors, *insertions])
+    return [*distinct[len(actors) :], *actors]
+
+
+def _sensor_pose(insertion: Insertion, mesh: SceneMesh, ground: GroundPlane, name: str) -> Floats:
     """Return the pose of an insertion in the sensor frame of the first sweep, of shape (4, 4)."""
     heading = np.radians(insertion.heading_deg)
     pose = np.eye(4)
     forward = np.array([np.cos(heading), np.sin(heading), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     if insertion.z_m is None:
-        z_m, up = ground.at(insertion.x_m, insertion.y_m, insertion.mesh.name, name)
-        z_m -= float(insertion.mesh.vertices[:, 2].min())
+        z_m, up = ground.at(insertion.x_m, insertion.y_m, mesh.name, name)
+        z_m -= float(mesh.vertices[:, 2].min())
     else:
         z_m = insertion.z_m
     left = np.cross(up, forward)
@@ -310,12 +324,13 @@ def _classes(
         )
         if index < len(effects.insertions) and effects.insertions[index].class_name:
             is_number = kind.isdecimal()
-            if numbers and kind not in numbers and not is_number:
+            known = find_class(kind, numbers)
+            if numbers and known is None and not is_number:
                 hint = did_you_mean(kind, numbers) or f" Known classes: {', '.join(numbers)}."
                 raise LidarError(f"Unknown class {kind!r} of the inserted object {name!r}.{hint}")
             if not numbers and not is_number:
                 unknown.append(kind)
-            result.append(int(kind) if is_number else numbers.get(kind, 0))
+            result.append(int(kind) if is_number else numbers.get(known or kind, 0))
         elif material is not None:
             result.append(int(material.semantic_class))
         else:

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from ..connection.tls_files import TlsFiles
 
 _PACKET_FIRINGS = 16  # firings per packet of --dropped-packets
-_INSERTION_OPTIONS = ("insert", "at", "heading", "class_name")
+_INSERTION_OPTIONS = ("insert", "at", "heading", "class_name", "object_name")
+_SPELLINGS = {"class_name": "--class", "object_name": "--name"}
 _ORDER = "lidarpool.augment.order"  # key of the order of options in the context
 
 
@@ -71,7 +72,7 @@ _MAX_SWEEPS = 1 << 31  # end of a range without an end
 
 
 class _InsertionCommand(click.Command):
-    """Command whose options --at, --heading and --class belong to the preceding --insert."""
+    """Command in which options such as --at belong to the preceding --insert."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments, and store the order of the options in the context."""
@@ -89,6 +90,7 @@ class _Placement(NamedTuple):
     at: tuple[float, ...]
     heading_deg: float
     class_name: str
+    name: str
 
 
 @click.command(cls=_InsertionCommand)
@@ -189,8 +191,8 @@ class _Placement(NamedTuple):
     metavar="SHAPE",
     multiple=True,
     shell_complete=completion.insertions,
-    help="Insert a car, a pedestrian or a mesh file; can be repeated. The options --at, --heading "
-    "and --class after it belong to this object.",
+    help="Insert a car, a pedestrian or a mesh file; can be repeated. The options --at, --heading, "
+    "--class and --name after it belong to this object.",
 )
 @click.option(
     "--at",
@@ -214,6 +216,14 @@ class _Placement(NamedTuple):
     metavar="NAME",
     multiple=True,
     help="Class of the inserted object (default: car or pedestrian for these shapes).",
+)
+@click.option(
+    "--name",
+    "object_name",
+    metavar="NAME",
+    multiple=True,
+    help="Name of the inserted object (default: its shape or file, with a number if it is "
+    "repeated).",
 )
 @click.option(
     "--sensor",
@@ -405,7 +415,7 @@ def _placements(settings: dict[str, Any]) -> list[_Placement]:
         if name == "insert":
             objects.append({"insert": next(values["insert"])})
         elif name in values:
-            option = "--class" if name == "class_name" else f"--{name}"
+            option = _SPELLINGS.get(name, f"--{name}")
             if not objects:
                 raise click.UsageError(
                     f"`{option}` must follow the `--insert` of the object to which it belongs."
@@ -423,7 +433,11 @@ def _placements(settings: dict[str, Any]) -> list[_Placement]:
             )
     return [
         _Placement(
-            entry["insert"], entry["at"], entry.get("heading", 0.0), entry.get("class_name", "")
+            entry["insert"],
+            entry["at"],
+            entry.get("heading", 0.0),
+            entry.get("class_name", ""),
+            entry.get("object_name", ""),
         )
         for entry in objects
     ]
@@ -438,4 +452,4 @@ def _load_insertion(placement: _Placement, terminal: Any) -> Insertion:
     x, y, z = (*placement.at, None)[:3]
     assert x is not None
     assert y is not None
-    return Insertion(mesh, x, y, z, placement.heading_deg, kind)
+    return Insertion(mesh, x, y, z, placement.heading_deg, kind, placement.name)

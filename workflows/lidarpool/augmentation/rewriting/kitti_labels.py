@@ -16,6 +16,7 @@ from lidarsim.numerics.arrays import Floats
 from ...clouds.boxes import SweepBoxes
 from ...clouds.kitti_boxes import LEVEL_CAMERA, read_calibration
 from ..augmented_sweep import AugmentedSweep
+from ..object_classes import find_class
 
 IMAGE_SIZE = (1242, 375)  # size of most KITTI images, width and height in pixels
 # Objects of which at least this fraction is visible have the occlusions 0 (fully visible) and 1
@@ -25,11 +26,7 @@ _FULLY_VISIBLE = 0.8
 _PARTLY_VISIBLE = 0.4
 _UNKNOWN_OCCLUSION = 3
 _MIN_DEPTH_M = 0.1  # depth at which edges of boxes behind the camera are cut
-_TYPES = {
-    name.casefold(): name
-    for name in ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
-}
-_TYPES |= {"human": "Pedestrian", "person": "Pedestrian", "bicyclist": "Cyclist"}
+_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 # Corners of a box from -0.5 to 0.5, and the corners that its edges connect.
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1])
@@ -174,8 +171,7 @@ def label_type(kind: str) -> str:
     >>> [label_type(kind) for kind in ("car", "Delivery van", "person")]
     ['Car', 'Delivery_van', 'Pedestrian']
     """
-    name = "_".join(kind.split()) or "Misc"
-    return _TYPES.get(name.casefold(), name)
+    return find_class(kind, _TYPES) or "_".join(kind.split()) or "Misc"
 
 
 def _cut_at_camera(corners: Floats) -> Floats:

@@ -5,25 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-# {type of an object, in lower case: category in nuScenes}
-_OFFICIAL = {
-    "barrier": "movable_object.barrier",
-    "bicycle": "vehicle.bicycle",
-    "bus": "vehicle.bus.rigid",
-    "car": "vehicle.car",
-    "child": "human.pedestrian.child",
-    "construction vehicle": "vehicle.construction",
-    "cyclist": "vehicle.bicycle",
-    "human": "human.pedestrian.adult",
-    "motorcycle": "vehicle.motorcycle",
-    "pedestrian": "human.pedestrian.adult",
-    "person": "human.pedestrian.adult",
-    "traffic cone": "movable_object.trafficcone",
-    "trailer": "vehicle.trailer",
-    "truck": "vehicle.truck",
-    "van": "vehicle.car",
-    "walker": "human.pedestrian.adult",
-}
+from ..object_classes import find_class
+
 # Category of all other objects in nuScenes-lidarseg, whose devkit accepts no new categories.
 OTHER_CATEGORY = "static.other"
 _LEVELS = {"v0-40": 0.4, "v40-60": 0.6, "v60-80": 0.8, "v80-100": 1.0}  # {level: upper limit}
@@ -37,25 +20,17 @@ _ATTRIBUTES = {
 }
 
 
-def _plain(name: str) -> str:
-    return name.casefold().replace("_", " ")
-
-
 def find_category(kind: str, names: Iterable[str]) -> str | None:
     """Return the category of an object type, or None if there is none.
 
     Examples
     --------
-    >>> names = ["none", "Bus", "vehicle.car", "vehicle.emergency.police"]
-    >>> [find_category(kind, names) for kind in ("Car", "bus", "police", "Boat")]
-    ['vehicle.car', 'Bus', 'vehicle.emergency.police', None]
+    >>> [find_category("Boat", names) for names in (["none"], ["none", "static.other"])]
+    [None, 'static.other']
     """
-    known = {_plain(name): name for name in names}
-    last_words = {plain.rpartition(".")[2]: name for plain, name in known.items()}
-    plain = _plain(kind)
-    official = _OFFICIAL.get(plain, "")
-    found = known.get(plain) or known.get(official) or last_words.get(plain)
-    return found or known.get(OTHER_CATEGORY)
+    listed = [*names]
+    found = find_class(kind, listed)
+    return OTHER_CATEGORY if found is None and OTHER_CATEGORY in listed else found
 
 
 def visibility_token(rows: Iterable[Mapping[str, Any]], visibility: float | None) -> str:
