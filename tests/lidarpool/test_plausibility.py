@@ -12,7 +12,7 @@ import yaml
 from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
-from lidarpool import Scene, SceneMesh
+from lidarpool import Scanner, Scene, SceneMesh, load_sensor
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_file import is_campaign
 from lidarpool.scenario.plausibility import plausibility_warnings
@@ -21,6 +21,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.paint import paint_scene
 from lidarscenes.writers.scene_file import write_scene
+from raybeam import RayCaster
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CITY = {"city-drive", "crossing", "crossing-night", "drive"}
@@ -197,6 +198,61 @@ def test_noise_above_a_tenth_of_the_range(tmp_path, sensor):
         tmp_path, scene="seed", noise={"range_m": 20}
     )  # with poses that were chosen
     assert "`noise.range_m` is 20 m" in warning
+
+
+BODY = block("Body", (1, 1, 1.5), 0.52, 0)  # its front is 2 cm in front of x = 0
+MAST = solid("Mast", creation.cylinder(0.03, 2), (0.1, 0.1, 1))
+CLOSE = {"poses": [[0, 0, 1]], "sensor": "velodyne/vlp16"}
+
+
+def share_of(warning: str) -> float:
+    """Return the fraction of the points in a warning about close surfaces."""
+    match = re.match(r"(\d+)% of the points are behind surfaces that are closer than", warning)
+    assert match, warning
+    return float(match[1]) / 100
+
+
+@pytest.mark.parametrize("mesh", [BODY, MAST], ids=["body", "mast"])
+def test_points_behind_surfaces_below_the_minimum_range_are_counted(tmp_path, mesh):
+    [warning] = warnings_of(tmp_path, [GROUND, TOWN[1], mesh], **CLOSE)
+    assert f"minimum range of 0.4 m, such as {mesh.name!r} at 0." in warning
+    assert f"add {mesh.name!r} to `unseen` of the sensor" in warning and "`blocked_deg`" in warning
+    scene = Scene.load(tmp_path / "scene.glb")
+    cloud = Scanner(scene, load_sensor("velodyne/vlp16")).sweep((0, 0, 1))
+    directions = np.asarray(cloud.positions, np.float64) - [0, 0, 1]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.tile([0.0, 0, 1], (len(directions), 1))
+    first = RayCaster(mesh.vertices, mesh.faces).cast(origins, directions)
+    expected = np.mean(first.distance < 0.4)
+    assert expected > 0.05 and share_of(warning) == pytest.approx(expected, abs=0.02)
+    assert warnings_of(tmp_path, **CLOSE, scene="scene.glb", mount=[-0.5, -0.5, 0]) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sensor": {"model": "velodyne/vlp16", "unseen": "Body"}},
+        {"sensor": {"model": "velodyne/vlp16", "min_range_m": 0}},
+        {"materials": [{"objects": "Body", "transparent": "pass"}, {"objects": "*"}]},
+    ],
+    ids=["housing", "no minimum", "window"],
+)
+def test_housings_and_windows_in_front_of_a_sensor_are_no_faults(tmp_path, change):
+    assert warnings_of(tmp_path, [GROUND, BODY], **(CLOSE | change)) == []
+
+
+def test_the_body_that_carries_a_sensor_is_close_to_it_alone(tmp_path):
+    """The body is an actor that moves with one of two sensors."""
+    points = [{"time_s": 0, "position": [-20, 5, 0]}, {"time_s": 4, "position": [20, 5, 0]}]
+    body = {"name": "Robot", "box": [0.4, 0.4, 0.8], "trajectory": {"points": points}}
+    sensors = {
+        "front": {"model": "velodyne/vlp16", "mount": [0.22, 0, 0.5]},
+        "above": {"model": "velodyne/vlp16", "mount": [0, 0, 1.5]},
+    }
+    moving = {"trajectory": {"points": points}, "actors": [body], "sensors": sensors}
+    [warning] = warnings_of(tmp_path, TOWN, **moving)
+    assert re.match(r"\d\d% of the points of front are behind", warning)
+    assert "such as 'Robot' at 0.02" in warning
 
 
 def drive(*points: tuple[float, ...]) -> dict[str, Any]:

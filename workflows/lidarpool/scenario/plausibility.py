@@ -17,6 +17,7 @@ from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
+from lidarsim.simulator.sampling import sample_near_surfaces
 from lidarsim.survey.survey import Survey
 from lidarsim.words import format_as_scenario, format_rounded, printable
 
@@ -52,6 +53,7 @@ _RISE_M = 5.0
 _RISE_SHARE = 0.3
 _FLAT = 0.1
 
+_NEAR_SHARE = 0.01  # fraction of the points behind close surfaces that is reported
 _POSITIONS = 24  # number of sampled sensor positions
 _TIMES = 20_000  # number of sampled times on a trajectory
 _FAR_PERCENT = 95  # percentile of distances that replaces a missing range limit
@@ -102,6 +104,8 @@ def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
     warnings += [*_noise_warnings(survey, visible_range_m)]
     if not chosen:
         warnings += _position_warnings(scene, survey, surroundings, samples)
+        if _is_near_sensor(scene, survey, surroundings, samples):
+            warnings += _near_surface_warnings(scene, survey)
     if survey.path.moves:
         motion = _motion(survey)
         is_airborne = _is_airborne(scene, survey, surroundings, positions)
@@ -256,24 +260,70 @@ def _bad_positions(
     return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f}){time}"
 
 
+def _is_near_sensor(
+    scene: Scene,
+    survey: Survey,
+    surroundings: PlacementChecker | None,
+    samples: list[_SensorPosition],
+) -> bool:
+    """Return whether a surface may be closer to a sensor than its minimum range."""
+    nearest_m = np.array([one.sensor.min_range_m for one in survey.mounted_sensors])
+    limits_m = nearest_m[[sample.sensor for sample in samples]]
+    if surroundings is None or not limits_m.any():
+        return False
+    positions = np.array([sample.position for sample in samples])
+    distances = surroundings.cast_around(positions).distance.reshape(len(samples), -1)
+    if (distances.min(axis=1) < limits_m).any():
+        return True
+    for actor in scene.actors:
+        local = _in_actor_frame(actor, samples)
+        gaps = np.maximum(actor.mesh.bounds[0] - local, local - actor.mesh.bounds[1])
+        if (np.linalg.norm(np.maximum(gaps, 0), axis=1) < limits_m).any():
+            return True
+    return False
+
+
+def _near_surface_warnings(scene: Scene, survey: Survey) -> Iterator[str]:
+    """Yield warnings about points behind surfaces that are closer than the minimum range."""
+    found = sample_near_surfaces(scene, survey)
+    for carried, near in zip(survey.mounted_sensors, found, strict=True):
+        if near is None or near.points < _NEAR_SHARE:
+            continue
+        name = printable(near.name)
+        yield (
+            f"{near.points:.0%} of the points{f' of {carried.name}' * bool(carried.name)} are "
+            f"behind surfaces that are closer than the minimum range of "
+            f"{carried.sensor.min_range_m:g} m, such as {name!r} at "
+            f"{format_rounded(near.distance_m)} m, because rays pass through them. Change `mount` "
+            f"or the poses. If the object is the housing or the window of the sensor, add {name!r} "
+            "to `unseen` of the sensor. If the vehicle blocks these rays, state their directions "
+            "as `blocked_deg` in the sensor file"
+        )
+
+
 def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
     """Mark the sensor positions that are inside the closed mesh of an actor.
 
     The mask has shape (k,).
     """
-    times = np.array([sample.time_ns for sample in samples])
     inside = np.zeros(len(samples), np.bool_)
     if not samples:
         return inside
-    positions, rotations = full_poses(actor.trajectory, 0, times)
-    offsets = np.array([sample.position for sample in samples]) - positions
-    local = np.einsum("kji,kj->ki", rotations, offsets)  # positions in the actor frame
+    local = _in_actor_frame(actor, samples)
     lower_m, upper_m = actor.mesh.bounds
     in_bounds = np.flatnonzero(((local > lower_m) & (local < upper_m)).all(axis=1))
     if len(in_bounds):
         surroundings = PlacementChecker(Scene.from_meshes([actor.mesh]))
         inside[in_bounds] = [surroundings.cast_around(local[k]).is_inside_body for k in in_bounds]
     return inside
+
+
+def _in_actor_frame(actor: Actor, samples: list[_SensorPosition]) -> Floats:
+    """Return the positions of sensors in the frame of an actor. Shape (k, 3)."""
+    times = np.array([sample.time_ns for sample in samples])
+    positions, rotations = full_poses(actor.trajectory, 0, times)
+    offsets = np.array([sample.position for sample in samples]) - positions
+    return np.asarray(np.einsum("kji,kj->ki", rotations, offsets))
 
 
 # -- noise -----------------------------------------------------------------------------------

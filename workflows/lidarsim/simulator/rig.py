@@ -14,7 +14,7 @@ from raybeam import Pattern
 from ..columns.actor_rays import NO_ACTOR_RAYS
 from ..errors import LidarError
 from ..motion.trajectory import Trajectory
-from ..numerics.arrays import Floats, Floats32, Integers, Records
+from ..numerics.arrays import Floats, Floats32, Integers, Ints32, Records
 from ..numerics.vectors import rotate
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -53,6 +53,7 @@ class CentralRays(NamedTuple):
     origins: Floats  # (3, n), meters
     directions: Floats  # (3, n), unit vectors
     ranges: Floats  # (n,), meters; inf if there is no surface within the range of the sensor
+    triangles: Ints32  # (n,), numbered as in `StoredTriangles`; -1 without a surface
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
@@ -305,8 +306,11 @@ class Rig:
             hits = caster.scan(chunk.pattern, chunk.poses, **chunk.limits)
             ranges = np.full(len(chunk.scan), np.inf)
             ranges[hits.ray] = hits.distance
+            triangles = np.full(len(chunk.scan), -1, np.int32)
+            triangles[hits.ray] = hits.triangle
             rays = chunk.computed_rays()[:, chunk.allowed]
-            yield CentralRays(rays[:3], rays[3:], ranges[chunk.allowed])
+            allowed = chunk.allowed
+            yield CentralRays(rays[:3], rays[3:], ranges[allowed], triangles[allowed])
 
     def _rays_of_scans(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float

@@ -11,7 +11,7 @@ import numpy as np
 from raybeam import available_backends
 
 from ..media.weather import Weather
-from ..numerics.arrays import Floats, Ints
+from ..numerics.arrays import Floats, Ints, Ints32
 from ..numerics.even_samples import even_indices
 from ..scene.scene import Scene
 from ..schema.declared import declared_values
@@ -23,7 +23,7 @@ from .rig import Rig
 SAMPLE_RAYS = 500_000  # maximum number of rays that `sample_survey` casts
 SAMPLE_SECTIONS = 500  # maximum number of sections of consecutive scans that are sampled
 SECTION_SCANS = 40  # maximum number of consecutive scans in a section
-RANGE_RAYS = 20_000  # maximum number of rays that `sample_ranges` casts
+RANGE_RAYS = 20_000  # number of rays that `sample_ranges` and `sample_near_surfaces` cast
 GOLDEN = 0.6180339887498949  # golden ratio minus 1
 
 
@@ -100,6 +100,81 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
     backend = "numpy" if available_backends()["tiles"] else "tiles"
     batches = _batches(Rig(scene, plain, backend), firsts, stops)
     return np.concatenate([np.zeros(0), *(batch.range for batch in batches)])
+
+
+class NearSurfaces(NamedTuple):
+    """Surfaces that rays of a sensor pass, because they are closer than its minimum range."""
+
+    points: float  # fraction of the points that are behind such a surface
+    name: str  # object that most of these rays pass
+    distance_m: float  # of the closest surface of this object
+
+
+def sample_near_surfaces(scene: Scene, survey: Survey) -> list[NearSurfaces | None]:
+    """Return the surfaces that are closer to each sensor than its minimum range.
+
+    Rays are sampled from the whole survey, without noise and weather. Surfaces through which light
+    passes anyway, such as windows and hedges, do not count. The entry of a sensor is None if no
+    sampled ray passes a surface and hits another one within the range.
+    """
+    carried = [
+        replace(mounted, sensor=replace(mounted.sensor, min_range_m=0.0), steps=steps)
+        for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True)
+    ]
+    # CUDA is never used, because its context would stay in this process.
+    backend = "numpy" if available_backends()["tiles"] else "tiles"
+    rig = Rig(scene, survey, backend)
+    unlimited = rig.with_survey(scene, replace(survey, sensors=carried))
+    passed: list[list[_PassedSurfaces]] = [[] for _ in carried]
+    for scan in _spread_scans(survey):
+        passed[survey.scan(scan).sensor] += _passed_surfaces(rig, unlimited, scan)
+    return [_near_surfaces(scene, rays) for rays in passed]
+
+
+class _PassedSurfaces(NamedTuple):
+    """Rays that pass an opaque surface and hit another one."""
+
+    points: int  # number of rays that hit a surface, including all others
+    objects: Ints32  # (k,), object whose surface a ray passes
+    distances: Floats  # (k,), meters
+
+
+def _spread_scans(survey: Survey) -> list[int]:
+    """Return scans of a survey that cover all directions of rotating heads."""
+    count = min(survey.scan_count, SAMPLE_SECTIONS)
+    count = min(count, max(1, RANGE_RAYS * survey.scan_count // survey.ray_count))
+    # If the scans were evenly spaced, they might have the same direction in each revolution.
+    shares = (np.arange(count) + np.arange(count) * GOLDEN % 1) / count
+    scans: list[int] = np.unique((shares * survey.scan_count).astype(np.int64)).tolist()
+    return scans
+
+
+def _passed_surfaces(rig: Rig, unlimited: Rig, scan: int) -> Iterator[_PassedSurfaces]:
+    """Cast the rays of a scan with the minimum range of the sensor and without it."""
+    survey = rig.survey
+    table = rig.surfaces.materials
+    is_opaque = ~(table.passes | (table.gap_fraction > 0) | (table.leaf_area > 0))
+    min_range_m = survey.mounted_sensors[survey.scan(scan).sensor].sensor.min_range_m
+    groups = (rig.central_rays(scan, scan + 1), unlimited.central_rays(scan, scan + 1))
+    for within, first in zip(*groups, strict=True):
+        is_point = np.isfinite(within.ranges)
+        rows = np.flatnonzero(is_point & (first.ranges < min_range_m))
+        triangles = first.triangles[rows]
+        chosen = is_opaque[rig.surfaces.triangle_kinds.of_triangles(triangles)]
+        objects = rig.surfaces.triangles.objects(triangles)[chosen]
+        yield _PassedSurfaces(int(is_point.sum()), objects, first.ranges[rows][chosen])
+
+
+def _near_surfaces(scene: Scene, passed: list[_PassedSurfaces]) -> NearSurfaces | None:
+    """Summarize the surfaces that rays of a sensor pass."""
+    objects = np.concatenate([np.zeros(0, np.int32), *(rays.objects for rays in passed)])
+    if not len(objects):
+        return None
+    distances = np.concatenate([rays.distances for rays in passed])
+    points = sum(rays.points for rays in passed)
+    number = int(np.bincount(objects).argmax())
+    nearest_m = float(distances[objects == number].min())
+    return NearSurfaces(len(objects) / points, scene.object_names[number], nearest_m)
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
