@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 
 from dask.sizeof import sizeof
 from dask.utils import funcname
-from distributed import CancelledError, Client, Future, Reschedule
+from distributed import CancelledError, Client, Future, KilledWorker, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
@@ -291,7 +291,8 @@ class Results(Iterator[Any]):
         self._closed = False
         self._begun = False  # whether a result was requested
         self._items_read = 0  # number of items read from the source
-        self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to send again
+        # Heap of items to send again: (index of the first item, items, maximum number per chunk).
+        self._unfinished: list[tuple[int, Sequence[Row], int]] = []
         self._size = ChunkSize()
         self._lead = LeadTime()
         self._running: dict[Future, Chunk] = {}
@@ -489,9 +490,10 @@ class Results(Iterator[Any]):
         Items that have to be sent again come first. New items are only read if `fresh` is true.
         """
         if self._unfinished:
-            first, rows = heapq.heappop(self._unfinished)
+            first, rows, most = heapq.heappop(self._unfinished)
+            size = min(size, most)
             if len(rows) > size:
-                heapq.heappush(self._unfinished, (first + size, rows[size:]))
+                heapq.heappush(self._unfinished, (first + size, rows[size:], most))
             return Chunk(first, rows[:size])
         if not fresh:
             return None
@@ -567,8 +569,13 @@ class Results(Iterator[Any]):
                 return
             chunk, answer = self._undelivered.pop(first)
             if isinstance(answer, Future):
-                error = answer.exception() if self._stages[-1].return_exceptions else None
-                if not _is_item_error(error):
+                error = None if answer.cancelled() else answer.exception()
+                if isinstance(error, KilledWorker) and len(chunk.rows) > 1:
+                    heapq.heappush(self._unfinished, (first, chunk.rows, 1))  # to find the item
+                    continue
+                if isinstance(error, KilledWorker):
+                    _add_note(error, chunk)
+                if not (self._stages[-1].return_exceptions and _is_item_error(error)):
                     self._failed = chunk, answer
                     return
                 answer = ChunkResult([error], (), 0)
@@ -576,7 +583,7 @@ class Results(Iterator[Any]):
             self._ready.extend(answer.results)
             self._next_item += count
             if count < len(chunk.rows):
-                heapq.heappush(self._unfinished, (first + count, chunk.rows[count:]))
+                heapq.heappush(self._unfinished, (first + count, chunk.rows[count:], MOST_ITEMS))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
         """Close the map, and raise a task's error with a note that names the items."""
@@ -586,12 +593,18 @@ class Results(Iterator[Any]):
         except Exception as error:
             if not (_is_item_error(error) or future.cancelled() or isinstance(error, PoolError)):
                 last = chunk.first + len(chunk.rows) - 1
-                error.add_note(
-                    f"{NOTE}The task processed items {chunk.first} to {last} of a map. Unless "
-                    "`window=1`, another task on the same worker may have killed the worker."
-                )
+                error.add_note(f"{NOTE}The task processed items {chunk.first} to {last} of a map.")
             raise
         raise AssertionError("the task has not failed")
+
+
+def _add_note(error: KilledWorker, chunk: Chunk) -> None:
+    """Name the only item of a task whose workers have died."""
+    shown = ", ".join(reprlib.repr(argument) for call in chunk.rows[0] for argument in call)
+    error.add_note(
+        f"{NOTE}Workers died while they processed item {chunk.first} of a map: {shown}. If workers "
+        "run several tasks at a time, another task may be the cause."
+    )
 
 
 def _worker_wait(stage: Stage) -> WorkerWait:
@@ -599,7 +612,7 @@ def _worker_wait(stage: Stage) -> WorkerWait:
 
 
 def _is_item_error(error: BaseException | None) -> bool:
-    """Return whether an error was raised by the mapped function, rather than by Dask."""
+    """Return whether a single item is known to be the cause of an error."""
     return any(note.startswith(NOTE) for note in getattr(error, "__notes__", ()))
 
 

@@ -351,7 +351,8 @@ class Partition:
             Number of slots that each task occupies on a worker.
         return_exceptions
             Whether to return the errors of `function` in place of its results. A map over this map
-            receives the errors as arguments. An item that kills its workers still ends the map.
+            receives the errors as arguments. The result of an item that kills its workers is
+            Dask's `KilledWorker`.
         empty_s
             Maximum time in seconds to wait while the partition has no workers, and no worker is
             starting, queued or requested by `adapt`. Pass `math.inf` to wait forever.

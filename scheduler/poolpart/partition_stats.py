@@ -86,8 +86,8 @@ class StageStats:
         Time in seconds that tasks waited for pipes, because a pipe was full or empty. For finished
         tasks, it is part of `seconds`. Running tasks are included.
     lost
-        Number of times that a task was assigned to a worker that died, whether or not the task had
-        started. Dask runs these tasks again. Finished results that are lost are not counted. A task
+        Number of times that a worker died while it was running a task, as far as the scheduler
+        knows. Dask runs these tasks again. Finished results that are lost are not counted. A task
         that Dask stops retrying after too many workers have died is counted as failed instead.
     """
 

@@ -12,7 +12,7 @@ from collections import Counter
 from types import SimpleNamespace
 
 import pytest
-from distributed import CancelledError, Client, Event, as_completed, get_worker
+from distributed import CancelledError, Client, Event, KilledWorker, as_completed, get_worker
 from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S, join, kill, leave, twice, wait_for
 
@@ -547,11 +547,18 @@ def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordere
 
 @pytest.mark.extended(every=2)
 @pytest.mark.parametrize("as_results", [True, False])
-def test_items_that_kill_their_workers_are_named(nannies, as_results):
+def test_an_item_that_kills_its_workers_is_one_error(nannies, monkeypatch, as_results):
+    monkeypatch.setattr(nannies.cluster.scheduler, "allowed_failures", 0)
     partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)
-    options = {"chunk": 2, "window": 1, "return_exceptions": as_results}
-    with pytest.raises(Exception, match="die_at_3-map") as caught:
-        list(partition.map(die_at_3, [3, 2, 1, 0], **options))
-    assert type(caught.value).__name__ == "KilledWorker"
-    (note,) = caught.value.__notes__
-    assert note.startswith("poolpart: The task processed items 0 to 1 of a map. Unless `window=1`")
+    results = partition.map(die_at_3, range(6), chunk=2, window=1, return_exceptions=as_results)
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    if as_results:
+        error, *others = results
+        assert others == [4, 5]
+    else:
+        with pytest.raises(KilledWorker) as caught:
+            next(results)
+        error = caught.value
+    assert isinstance(error, KilledWorker)
+    (note,) = error.__notes__
+    assert note.startswith("poolpart: Workers died while they processed item 3 of a map: 3.")

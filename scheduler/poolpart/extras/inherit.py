@@ -41,8 +41,17 @@ from ..internals.method_rules import (
     add_graph_rule,
     add_shuffle_rule,
 )
-from ..internals.names import CHOOSING, EXISTING, NESTED, READING, SHUFFLES, require_feature
+from ..internals.names import (
+    BLAMING,
+    CHOOSING,
+    EXISTING,
+    NESTED,
+    READING,
+    SHUFFLES,
+    require_feature,
+)
 from ..internals.scheduler import Resources, set_worker_plugin
+from .blaming import DeathBlame
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
 
@@ -64,6 +73,7 @@ class Inheritance(SchedulerPlugin):
         self._rules = MethodRules()
         self._choice: WorkerChooser | None = None
         self._unreadable: UnreadableInputs | None = None
+        self._blame: DeathBlame | None = None
         self.lends = self._enable_part(
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
         )
@@ -76,6 +86,9 @@ class Inheritance(SchedulerPlugin):
         self._enable_part(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
         self._enable_part(
             READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read
+        )
+        self._enable_part(
+            BLAMING, "The death of a worker counts against all of its tasks.", self._acquit
         )
         scheduler.add_plugin(self)
 
@@ -108,6 +121,9 @@ class Inheritance(SchedulerPlugin):
     def _read(self) -> None:
         self._unreadable = UnreadableInputs(self.scheduler, self.names)
 
+    def _acquit(self) -> None:
+        self._blame = DeathBlame(self.scheduler, self.names)
+
     def _inherited_resources(self, task: Any) -> Resources:
         """Return the resources that nested tasks inherit from a task, empty outside partitions."""
         resources = task.resource_restrictions
@@ -120,6 +136,8 @@ class Inheritance(SchedulerPlugin):
             self._choice.uninstall()
         if self._unreadable is not None:
             self._unreadable.uninstall()
+        if self._blame is not None:
+            self._blame.uninstall()
         self.scheduler.remove_plugin(NAME)
 
 

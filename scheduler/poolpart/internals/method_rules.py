@@ -340,6 +340,38 @@ def add_choice_rule(rules: MethodRules, scheduler: Any, choose: Callable[[Any], 
     rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
+_DEAD = "poolpart-dead"  # key in the scheduler's state of a worker: whether it is being removed
+
+
+def add_removal_rule(
+    rules: MethodRules, scheduler: Any, prepare: Callable[[Any], None]
+) -> Callable[[], None]:
+    """Call `prepare(worker)` before a worker that has died is removed, once for each worker.
+
+    Returns a function that removes the rule.
+    """
+
+    def remove(address: str, *, expected: bool = False, **options: Any) -> Any:
+        worker = scheduler.workers.get(address)
+        # Dask removes a worker when its connection closes and when its nanny reports the end.
+        if worker is not None and not expected and not worker.extra.get(_DEAD):
+            worker.extra[_DEAD] = True
+            prepare(worker)
+        return NotImplemented
+
+    rules.call_instead(scheduler, "remove_worker", remove, "expected")
+    handler = scheduler.handlers["unregister"]
+    stand_in = scheduler.remove_worker
+    scheduler.handlers["unregister"] = stand_in  # instead of the method of the class
+
+    def end() -> None:
+        rules.remove_all()
+        if scheduler.handlers["unregister"] is stand_in:
+            scheduler.handlers["unregister"] = handler
+
+    return end
+
+
 def add_failed_fetch_rule(
     rules: MethodRules, scheduler: Any, report: Callable[[Any, str], None]
 ) -> None:

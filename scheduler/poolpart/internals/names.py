@@ -39,6 +39,7 @@ ADAPTING = "adaptive partitions"
 CANCELLING = "Partition.cancel"
 CLIENTS = "Partition.as_client"
 BALANCING = "Pool.balance"
+BLAMING = "blaming the death of a worker on running tasks only"
 READING = "errors for inputs that cannot be unpickled"
 
 
@@ -394,6 +395,22 @@ PRIVATE_NAMES = (
         ),
         "let a task fail if its worker cannot unpickle an input",
         ("test_unreadable.py::test_a_task_whose_worker_cannot_unpickle_its_input_fails",),
+    ),
+    PrivateNames(
+        BLAMING,
+        (
+            f"{_SCHEDULER}.remove_worker(address, expected)",
+            f"{_SCHEDULER}.handlers",
+            f"{_SCHEDULER_TASK}.suspicious",
+            f"{_SCHEDULER_TASK}.priority",
+            "distributed.scheduler:TaskPrefix.suspicious",
+            f"{_SCHEDULER_WORKER}.executing",
+            f"{_SCHEDULER_WORKER}.long_running",
+            f"{_SCHEDULER_WORKER}.processing",
+            f"{_SCHEDULER_WORKER}.extra",
+        ),
+        "count the death of a worker only against tasks that may have been running",
+        ("test_deaths.py::test_only_running_tasks_are_blamed",),
     ),
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -120,6 +120,41 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
             restrictions = task.resource_restrictions.items()
             remaining = {name: slots for name, slots in restrictions if name not in names}
             task.resource_restrictions = remaining or None
+
+
+# -- running tasks -------------------------------------------------------------------------
+
+
+def running_candidates(worker: Any) -> set[Any]:
+    """Return the tasks that a worker runs, or may run, as far as the scheduler knows.
+
+    These are the tasks in the last heartbeat of the worker, tasks that have seceded, and in the
+    remaining slots the tasks with the highest priority. A task that has seceded may have lent its
+    slots.
+    """
+    running = (worker.executing.keys() & worker.processing) | worker.long_running
+    free = dict(worker.resources)
+    threads = worker.nthreads
+    for task in running - worker.long_running:
+        threads -= 1
+        for name, slots in (task.resource_restrictions or {}).items():
+            free[name] = free.get(name, 0) - slots
+    for task in sorted(worker.processing - running, key=lambda task: task.priority):
+        slots = task.resource_restrictions or {}
+        if any(free.get(name, 0) < number for name, number in slots.items()):
+            continue
+        if slots or threads > 0:
+            running.add(task)
+            threads -= 1
+            free.update({name: free[name] - number for name, number in slots.items()})
+    return running
+
+
+def acquit_tasks(tasks: Iterable[Any]) -> None:
+    """Compensate the next death that Dask counts against each of these tasks."""
+    for task in tasks:
+        task.suspicious -= 1
+        task.prefix.suspicious -= 1
 
 
 # -- moving waiting tasks with the work stealing protocol -----------------------------------
