@@ -16,7 +16,7 @@ from tests.simulated_drives import simulated_points
 
 from lidarpool import LidarError, Mounted, Scene, Survey, Track, load_sensor
 from lidarpool.plan.flight import plan_flight
-from lidarpool.plan.flight_area import read_area, transform_shape
+from lidarpool.plan.flight_area import read_area, transform_shape, utm_epsg
 from lidarpool.plan.flight_density import (
     DensityMap,
     Squares,
@@ -150,6 +150,69 @@ def test_turns_are_as_short_as_possible():
     assert all(s.curvature for s in narrow)
     legs = [FlightLeg(np.zeros(2), np.array([100.0, 0]), np.array([50.0])) for _ in range(2)]
     assert fly(legs, 30).times_s[-1] > 2 * 100 / 30
+
+
+def turn_length(start, first, stop, last):
+    turn = shortest_turn(np.array(start), first, np.array(stop), last, 1.0)
+    return sum(section.length_m for section in turn)
+
+
+def test_turns_are_as_short_in_a_mirror_and_backward():
+    """If the length of one kind of path was wrong, that of its mirror image would differ."""
+    rng = np.random.default_rng(3)
+    cos, sin = math.cos(2), math.sin(2)
+    for x, y, first, last in rng.uniform(-1, 1, (300, 4)) * (3.5, 3.5, math.pi, math.pi):
+        length = turn_length((0, 0), first, (x, y), last)
+        assert length >= math.hypot(x, y)
+        for other in (
+            turn_length((0, 0), -first, (x, -y), -last),
+            turn_length((x, y), last + math.pi, (0, 0), first + math.pi),
+            turn_length(
+                (5, 7), first + 2, (5 + x * cos - y * sin, 7 + x * sin + y * cos), last + 2
+            ),
+        ):
+            assert other == pytest.approx(length, abs=1e-6)
+
+
+def test_a_single_arc_has_no_further_circle():
+    rng = np.random.default_rng(1)
+    for heading, angle in rng.uniform((-math.pi, 0.1), (math.pi, 3), (200, 2)):
+        for sign in (1, -1):
+            center = sign * np.array([-math.sin(heading), math.cos(heading)])
+            end = heading + sign * angle
+            stop = center + sign * np.array([math.sin(end), -math.cos(end)])
+            assert turn_length((0, 0), heading, stop, end) == pytest.approx(angle, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("first", "stop", "last", "expected"),
+    [
+        (0.0, (0.0, 4.0), math.pi, math.pi + 2),  # a half circle with a straight section
+        (0.0, (0.0, -4.0), math.pi, math.pi + 2),
+        (0.0, (2.0, 2.0), 0.0, math.pi),  # a quarter to the left, and one to the right
+        (0.0, (2.0, -2.0), 0.0, math.pi),
+    ],
+)
+def test_lengths_of_turns(first, stop, last, expected):
+    assert turn_length((0, 0), first, stop, last) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("cliff_m", [60.0, -60.0])
+def test_an_aircraft_that_follows_the_ground_passes_a_cliff_on_a_ramp(scanner, cliff_m):
+    """Heights are averaged over a distance equal to the height above ground."""
+    steps = [(-1000, 500, 0.0), (500, 2000, cliff_m)]
+    meshes = [quad(f"{a}", (a, -600, z), (b, -600, z), (b, 800, z), (a, 800, z))
+              for a, b, z in steps]  # fmt: skip
+    ground = Terrain(Scene.from_meshes(meshes))
+    area = shapely.box(0, 0, 1000, 200)
+    plan = planned(scanner, area, ground, heading_deg=90, agl_m=200, follow=True)
+    leg = plan.lines[0].leg
+    along = np.linspace(0, leg.length_m, len(leg.heights)) + leg.start[0]
+    expected = 200 + cliff_m * np.clip((along - 400) / 200, 0, 1)
+    np.testing.assert_allclose(leg.heights, expected, atol=2.5)
+    low_m, mean_m, high_m = plan.lines[0].clearance_m
+    assert (low_m, high_m) == pytest.approx((170, 230), abs=3)
+    assert mean_m == pytest.approx(200, abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -292,6 +355,39 @@ def test_the_expected_density_is_that_of_a_simulation():
     assert summary.low_m2 < summary.mean_m2
 
 
+def test_the_expected_density_may_come_from_a_part_of_the_rays(monkeypatch):
+    scene, survey = strip()
+    area = [[(20, -80), (140, -80), (140, 80), (20, 80)]]
+    every_ray = summarize_density(expected_density(scene, survey, area), 2.0)
+    assert survey.ray_count > 50_000
+    monkeypatch.setattr("lidarpool.plan.flight_density.SAMPLED_RAYS", 10_000)
+    sampled = summarize_density(expected_density(scene, survey, area), 2.0)
+    assert sampled.mean_m2 == pytest.approx(every_ray.mean_m2, rel=0.02)
+    assert sampled.low_m2 == pytest.approx(every_ray.low_m2, rel=0.2)
+
+
+def test_squares_are_placed_from_their_southwest_corner():
+    squares = Squares(np.arange(6.0).reshape(2, 3), np.array([10.0, -4.0]), 2.0)
+    x, y = squares.centers
+    assert (x.tolist(), y.tolist()) == ([11, 13, 15], [-3, -1])
+    over = squares.over([[(13, -3), (19, -3), (19, 1), (13, 1)]])
+    assert over.corner.tolist() == [12, -4]
+    assert over.counts.tolist() == [[1, 2, 0, 0], [4, 5, 0, 0], [0, 0, 0, 0]]
+    before = squares.over([[(7, -7), (11, -7), (11, -3), (7, -3)]])
+    assert before.corner.tolist() == [6, -8]
+    assert not before.counts.any()
+
+
+def test_a_twentieth_of_an_area_may_be_sparser():
+    density = np.arange(1.0, 101.0).reshape(10, 10)
+    covered = np.ones((10, 10))
+    covered[0, :4] = 0.1  # too small for a density
+    found = summarize_density(DensityMap(density, covered, np.zeros(2), 1.0), 51.0)
+    assert found.low_m2 == 9  # 4.8 of the 96 cells from 5 to 100 are below
+    assert found.reached == pytest.approx(50 / 96)
+    assert found.mean_m2 == pytest.approx((5050 - 0.9 * 10) / 96.4)
+
+
 def test_areas_with_holes():
     area = [[(0, 0), (10, 0), (10, 10), (0, 10)], [(4, 4), (6, 4), (6, 6), (4, 6)]]
     x, y = np.array([-1.0, 1, 5, 11]), np.array([1.0, 5, 7])
@@ -398,6 +494,22 @@ def test_geojson_that_is_no_area(tmp_path, content, words):
     file.write_text(json.dumps(content))
     with pytest.raises(LidarError, match=words):
         read_area(str(file))
+
+
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "epsg"),
+    [
+        (9.1, 48.7, 32632),
+        (-179.9, 1, 32601),
+        (179.9, -1, 32760),
+        (-70.7, -33.4, 32719),
+        (-0.1, 51.5, 32630),
+        (0.1, 51.5, 32631),
+    ],
+)
+def test_utm_zones(longitude, latitude, epsg):
+    shape = shapely.box(longitude - 0.05, latitude - 0.05, longitude + 0.05, latitude + 0.05)
+    assert utm_epsg(shape) == epsg
 
 
 @pytest.mark.extended

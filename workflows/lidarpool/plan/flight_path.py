@@ -18,6 +18,7 @@ SAMPLE_S = 0.5  # interval between poses
 _GRAVITY_M_S2 = 9.80665
 _ROLL_SAMPLES = 5  # number of samples over which the aircraft rolls into a turn
 _MAX_POSES = 200_000
+_ROUNDING = 1e-9  # maximum rounding error of angles and lengths for a turn radius of 1
 # Curvature signs of the three segments of a shortest path (Dubins 1957).
 _WORDS = {
     "LSL": (1, 0, 1),
@@ -167,12 +168,15 @@ def _dubins(a: float, b: float, d: float) -> dict[str, tuple[float, float, float
     sa, sb, ca, cb = math.sin(a), math.sin(b), math.cos(a), math.cos(b)
     cab = math.cos(a - b)
     lengths: dict[str, tuple[float, float, float]] = {}
-    if (square := 2 + d * d - 2 * cab + 2 * d * (sa - sb)) >= 0:
-        angle = math.atan2(cb - ca, d + sa - sb)
-        lengths["LSL"] = angle - a, math.sqrt(square), b - angle
-    if (square := 2 + d * d - 2 * cab + 2 * d * (sb - sa)) >= 0:
-        angle = math.atan2(ca - cb, d - sa + sb)
-        lengths["RSR"] = a - angle, math.sqrt(square), angle - b
+    # The straight section connects the centers of both arcs. If they coincide, there is one arc.
+    east, north = d + sa - sb, cb - ca
+    p = math.hypot(east, north)
+    angle = math.atan2(north, east) if p > _ROUNDING else b
+    lengths["LSL"] = angle - a, p, b - angle
+    east, north = d - sa + sb, ca - cb
+    p = math.hypot(east, north)
+    angle = math.atan2(north, east) if p > _ROUNDING else b
+    lengths["RSR"] = a - angle, p, angle - b
     if (square := -2 + d * d + 2 * cab + 2 * d * (sa + sb)) >= 0:
         p = math.sqrt(square)
         angle = math.atan2(-ca - cb, d + sa + sb) - math.atan2(-2.0, p)
@@ -191,11 +195,17 @@ def _dubins(a: float, b: float, d: float) -> dict[str, tuple[float, float, float
         p = 2 * math.pi - math.acos(cosine)
         t = -a - math.atan2(ca - cb, d + sa - sb) + p / 2
         lengths["LRL"] = t, p, b - a - t + p
-    turn = 2 * math.pi
     return {
-        word: (t % turn, p if word[1] == "S" else p % turn, q % turn)
+        word: (_arc(t), p if word[1] == "S" else _arc(p), _arc(q))
         for word, (t, p, q) in lengths.items()
     }
+
+
+def _arc(angle: float) -> float:
+    """Return an angle from 0 to 2π, where a rounding error below 0 is no full circle."""
+    turn = 2 * math.pi
+    reduced = angle % turn
+    return 0.0 if turn - reduced < _ROUNDING else reduced
 
 
 class _Plane(NamedTuple):
