@@ -107,9 +107,7 @@ def test_a_response_explains_intensities_at_other_ranges_and_incidences(model):
     ring = np.array([3, 0, 1, 2])
     surfel = np.array([0, 50, 100, 399])
     expected = reflectance[::40][surfel] * white(ring, range_m, cosine)
-    np.testing.assert_allclose(
-        found.intensities(surfel, range_m, cosine, ring), expected, rtol=0.2
-    )
+    np.testing.assert_allclose(found.intensities(surfel, range_m, cosine, ring), expected, rtol=0.2)
     figures = response.figures()
     assert figures["model"] == model.value
     assert np.shape(figures["by_ring"]) == (4, 11)
