@@ -309,7 +309,7 @@ def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
     np.savetxt(tmp_path / "a.lines", points)
     recording = open_recording(tmp_path / "a.lines")
     np.testing.assert_array_equal(recording[0].points, points)
-    scanned, epsg = read_points(tmp_path / "a.lines", None, report=print)
+    scanned, epsg, _ = read_points(tmp_path / "a.lines", None, report=print)
     np.testing.assert_array_equal(scanned.points, points)
     assert epsg is None
     told = refused(save_cloud, Cloud(points, {}), tmp_path / "b.lines", format="lines")

@@ -265,7 +265,7 @@ def test_scenes_are_made_of_the_same_points(result, name):
     path = folder / {"e57": "all.e57", "las": "all.las"}.get(name, f"all_{name}")
     pytest.importorskip({"e57": "pye57", "las": "laspy"}.get(name, "numpy"))
     save_cloud(cloud, path, format=name, **({"compensated": True} if name == "pcd" else {}))
-    points, _ = read_points(path / file if file else path, None, lambda note: None)
+    points = read_points(path / file if file else path, None, lambda note: None).points
     expected = cloud.positions
     if file:
         first = open_recording(cloud)[0]

@@ -36,6 +36,24 @@ _INTENSITIES = tuple((name,) for name in STRENGTHS)
 _QUANTITIES = (_CLASS, *_INTENSITIES, COLORS, NORMALS, ORIGINS)  # standard names of components
 
 
+class PlacedPoints(NamedTuple):
+    """Points in true meters, with the coordinate system in which they are.
+
+    Attributes
+    ----------
+    points
+        The points and their columns.
+    epsg
+        EPSG code of the coordinate system, or None if it is unknown.
+    vertical_datum
+        Name of the datum of heights, or an empty string if it is unknown.
+    """
+
+    points: Sweep
+    epsg: int | None
+    vertical_datum: str
+
+
 def read_points(
     path: Path,
     unit: str | None,
@@ -43,8 +61,8 @@ def read_points(
     *,
     epsg: int | None = None,
     keep_noise: bool = False,
-) -> tuple[Sweep, int | None]:
-    """Read the finite points of a file in true meters, and the EPSG code if it is known.
+) -> PlacedPoints:
+    """Read the finite points of a file in true meters, with their coordinate system if it is known.
 
     Scans are merged in the frame of the file. The sweep contains the following columns if the file
     has them:
@@ -109,7 +127,9 @@ def read_points(
     if points.skipped:
         names = ", ".join(map(printable, points.skipped))
         report(f"{path} has data that surfels cannot store, which were skipped: {names}")
-    return points, placed_epsg
+    system = None if unit is not None else recording.system
+    datum = "" if system is None else system.vertical_datum
+    return PlacedPoints(points, placed_epsg, datum)
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:

@@ -189,14 +189,16 @@ def points_to_scene(
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} must be a positive number, but is {value}.")
-    points, placed_epsg = read_points(path, unit, report, epsg=epsg, keep_noise=keep_noise)
-    points = _select_color(path, points, color, report)
+    placed = read_points(path, unit, report, epsg=epsg, keep_noise=keep_noise)
+    points = _select_color(path, placed.points, color, report)
     surfels = _compute_surfels(path, points, voxel_m, size)
     loss = None
     if (scanners := vectors(points, ORIGINS)) is not None:
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         loss = expected_loss(points.points, scanners, corners)
-    scene = replace(Scene.from_meshes([surfels.mesh]), epsg=placed_epsg)
+    scene = replace(
+        Scene.from_meshes([surfels.mesh]), epsg=placed.epsg, vertical_datum=placed.vertical_datum
+    )
     return PointScene(scene, surfels.voxel_m, loss)
 
 

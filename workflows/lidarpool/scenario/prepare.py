@@ -28,6 +28,7 @@ from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER, Pose, Track
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
+from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise, Returns, Sensor
@@ -254,6 +255,7 @@ def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
     scene = static.scene
     findings = shapes.findings
     epsg = _common_epsg(scenario, findings)
+    _check_heights(scenario, findings)
     with prefix_errors(scenario.source):
         if scenario.world.epsg is not None:  # fail before files of moving objects are read
             check_epsg(scenario.world.epsg, scene.with_world_origin(scenario.world.origin))
@@ -345,7 +347,7 @@ def _common_epsg(scenario: Scenario, findings: FileFindings) -> int | None:
     different system and is not transformed. Raise LidarError if the files have different coordinate
     systems, or if `world.origin` would move them.
     """
-    systems = {system.crs: system for system in findings.systems}
+    systems = {system.crs: system for system in findings.systems if system.crs}
     x, y, _ = scenario.world.origin
     if systems and (x or y):
         first = next(iter(systems.values()))
@@ -371,6 +373,32 @@ def _common_epsg(scenario: Scenario, findings: FileFindings) -> int | None:
             "to it, but you must convert all other files."
         )
     return next((system.epsg for system in systems.values()), None)
+
+
+def _check_heights(scenario: Scenario, findings: FileFindings) -> None:
+    """Raise LidarError if the files of a scene have heights in different vertical datums.
+
+    If only some files with a coordinate system state a vertical datum, add a note.
+    """
+    systems = [system for system in findings.systems if system.vertical_datum is not None]
+    first = next((system for system in systems if system.vertical_datum), None)
+    if first is None:
+        return
+    datum = str(first.vertical_datum)
+    for system in systems:
+        other = str(system.vertical_datum)
+        if not other:
+            findings.notes.append(
+                f"{system.file} does not state a vertical datum. Its heights are assumed to be "
+                f"{describe_heights(datum)}, as in {first.file}"
+            )
+        elif not same_vertical_datum(datum, other):
+            raise LidarError(
+                f"{scenario.source}: {first.file} has {describe_heights(datum)}, but {system.file} "
+                f"has {describe_heights(other)}. Transform one of them first, for example with "
+                "gdalwarp or PDAL and a geoid grid, or set `translation: [0, 0, Z]` for one of the "
+                "files if the difference is constant."
+            )
 
 
 def _check_sensors(scenario: Scenario) -> None:

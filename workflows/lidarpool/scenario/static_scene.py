@@ -63,12 +63,14 @@ Value = TypeVar("Value")
 
 
 class FileCrs(NamedTuple):
-    """Coordinate system of a file whose x and y coordinates are not transformed."""
+    """Coordinate system of a file whose x and y coordinates, or heights, are not transformed."""
 
     file: str
-    crs: str  # as "EPSG:25832" or WKT
+    crs: str  # as "EPSG:25832" or WKT; empty if it is unknown, or if x and y are transformed
     epsg: int | None
     is_raster: bool  # whether the file is reprojected to `world.epsg`
+    # Datum of the heights, empty if it is unknown, or None if heights are transformed.
+    vertical_datum: str | None
 
 
 @dataclass
@@ -242,18 +244,22 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
 
 
 def _file_crs(entry: MeshFile, objects: Objects) -> FileCrs | None:
-    """Return the coordinate system that a file states for its x and y coordinates.
+    """Return the coordinate system that a file states.
 
-    Return None if the file does not specify a coordinate system, or if x and y are transformed.
+    Return None if the file specifies neither a coordinate system nor a vertical datum, or if both
+    its coordinates and its heights are transformed.
     """
-    if not entry.transform().keeps_xy:
+    transform = entry.transform()
+    raster = objects.raster
+    epsg = objects.epsg if raster is None else raster.epsg
+    crs = raster.crs if raster is not None else f"EPSG:{epsg}" if epsg else ""
+    if not (crs or objects.vertical_datum):
         return None
-    if objects.raster is not None:
-        raster = objects.raster
-        return FileCrs(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
-    if objects.epsg is None:
-        return None
-    return FileCrs(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
+    is_raster = raster is not None
+    datum = objects.vertical_datum if transform.keeps_z else None
+    if not transform.keeps_xy:
+        return FileCrs(entry.file, "", None, is_raster, datum) if datum else None
+    return FileCrs(entry.file, crs, epsg, is_raster, datum)
 
 
 def _check_not_empty(scenario: Scenario) -> None:

@@ -30,6 +30,7 @@ from lidarsim.scene.files.coordinate_systems import (
     linear_unit,
     scale_problem,
     suggested_epsg,
+    vertical_datum,
 )
 from lidarsim.scene.files.polygons import check_corners, triangulate, triangulate_with_holes
 from lidarsim.scene.files.scene_graph import (
@@ -344,6 +345,7 @@ class _CityFile:
         content = placed_content(self._placed)
         content.unit_m = system.unit_m
         content.up_axis = "z"
+        content.vertical_datum = "" if system.crs is None else vertical_datum(system.crs)
         content.classes = CLASSES
         levels = [
             f"{plural(n, 'object')} with LoD {f'{level:g}' if level >= 0 else 'unknown'}"

@@ -43,6 +43,7 @@ from lidarsim.scene.files.coordinate_systems import (
     target_problem,
     transform_coordinates,
     utm_code,
+    vertical_datum,
 )
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
@@ -135,7 +136,10 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
         target_crs = _target_crs(source, request.epsg, notes)
         mesh, summary = _raster_mesh(source, target_crs, path, options, notes)
     raster = Raster(*crs_key(target_crs), summary)
-    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster, is_landscape=True)
+    content = Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
+    content.is_landscape = True
+    content.vertical_datum = source.vertical_datum
+    return content
 
 
 def _raster_mesh(
@@ -236,6 +240,7 @@ class _Source:
     affine: Any  # transform from columns and rows to x and y, in meters in a local system
     crs: Any  # horizontal coordinate system of x and y, or None without a position on Earth
     up_m: float | None  # unit of the vertical coordinate system in meters
+    vertical_datum: str = ""  # empty if the raster does not state it
     local: _LocalSystem | None = None  # stated system without a position on Earth
 
     def heights_m(self, values: Floats, unit_m: float) -> Floats:
@@ -272,7 +277,7 @@ def _source(file: Any, path: Path) -> _Source:
         return _Source(file, affine, None, None)
     crs, up_m = horizontal_part(stated)
     if crs.is_projected or crs.is_geographic:
-        return _Source(file, affine, crs, up_m)
+        return _Source(file, affine, crs, up_m, vertical_datum(stated))
     unit = linear_unit(crs) if is_local(crs) else None
     if unit is None:
         raise MeshFileError(
@@ -282,7 +287,7 @@ def _source(file: Any, path: Path) -> _Source:
     name, unit_m = unit
     local = _LocalSystem(str(projjson(crs)["name"])[:80], name, unit_m)
     scaled = Affine(*(unit_m * number for number in [*affine][:6]))
-    return _Source(file, scaled, None, up_m, local)
+    return _Source(file, scaled, None, up_m, vertical_datum(stated), local)
 
 
 def _stated_crs(file: Any, path: Path) -> Any:
@@ -316,6 +321,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         settings = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+        settings["GTIFF_REPORT_COMPD_CS"] = True  # also for GeoTIFF 1.0
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=MIN_LIMIT_BYTES, **settings))
         try:
             if driver == "GTiff":  # may exceed the memory, because only a window is read

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Indices, Ints32
+from lidarsim.numerics.arrays import AnyArray, Bytes, Indices, Ints32
 from lidarsim.numerics.vectors import matmul, matvec, rotate
 from lidarsim.scene.colors import LINEAR
 from lidarsim.scene.files.scene_graph import GENERATOR
@@ -40,7 +40,7 @@ def encode_glb(scene: Scene) -> bytes:
     LidarError
         If the file would exceed 4 GiB.
     """
-    writer = _Writer(scene.origin, scene.epsg)
+    writer = _Writer(scene)
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
         instances: dict[bytes, list[SceneMesh | SceneInstance]] = {}
         for part in parts:
@@ -54,9 +54,11 @@ def encode_glb(scene: Scene) -> bytes:
 class _Writer:
     """The JSON content and the binary buffer of a .glb file."""
 
-    def __init__(self, origin: Floats, epsg: int | None) -> None:
-        self._origin = origin
-        extras = {} if epsg is None else {"extras": {"epsg": epsg}}
+    def __init__(self, scene: Scene) -> None:
+        self._origin = scene.origin
+        stated = {"epsg": scene.epsg, "vertical_datum": scene.vertical_datum}
+        system = {name: value for name, value in stated.items() if value}
+        extras = {"extras": system} if system else {}
         self._pieces: list[bytes] = []
         self._size = 0
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}

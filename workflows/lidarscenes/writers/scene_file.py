@@ -32,7 +32,7 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     triangle has both a mask and a texture, its color is the mean of the texture. All formats store
     world coordinates in meters. A .glb file is Y-up, as its standard requires, and .ply and .obj
     files are Z-up. Coordinates in .ply and .glb have single precision. In .glb, they are relative
-    to the scene's origin. The coordinate system, `Scene.epsg`, is preserved. A comment, or the
+    to the scene's origin. `Scene.epsg` and `Scene.vertical_datum` are preserved. A comment, or the
     generator in .glb, identifies this package as the writer of the file for `load_meshes`. An
     existing file is replaced only once the new file is complete.
 
@@ -104,4 +104,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 def _comments(scene: Scene) -> list[str]:
     """Return the comments at the start of a file, on units, axes, and the coordinate system."""
-    return [FORMAT_COMMENT, *([] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"])]
+    comments = [FORMAT_COMMENT]
+    comments += [] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"]
+    datum = scene.vertical_datum.encode("ascii", "replace").decode()
+    return comments + ([f"vertical datum: {datum}"] if datum else [])

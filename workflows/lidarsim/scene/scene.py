@@ -79,6 +79,9 @@ class Scene:
     epsg
         EPSG code of the world coordinates, if the scene file specifies it. Pass it to `Survey` to
         write it to the results.
+    vertical_datum
+        Name of the vertical datum of the world coordinates, "ellipsoid" for ellipsoidal heights, or
+        an empty string if the scene file does not specify it.
 
     Raises
     ------
@@ -97,6 +100,7 @@ class Scene:
     materials: ObjectMaterials | None = None
     world_origin: Floats = field(default_factory=lambda: np.zeros(3))
     epsg: int | None = None
+    vertical_datum: str = ""
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -245,6 +249,7 @@ class Scene:
             return cls.from_meshes(objects.at_start(lambda line: report(note_start + line)))
         scene = cls.from_meshes(objects.static)
         object.__setattr__(scene, "epsg", objects.epsg)
+        object.__setattr__(scene, "vertical_datum", objects.vertical_datum)
         actors = []
         for actor in objects.actors:
             track = actor.trajectory

@@ -97,6 +97,11 @@ class Transform:
         """Whether the transform leaves x and y unchanged."""
         return not self.offset[:2].any() and bool((self.linear[:2] == np.eye(3)[:2]).all())
 
+    @property
+    def keeps_z(self) -> bool:
+        """Whether the transform leaves z unchanged."""
+        return not self.offset[2] and bool((self.linear[2] == np.eye(3)[2]).all())
+
     @classmethod
     def from_parts(
         cls,

@@ -14,6 +14,8 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
+from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
+from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.schema.vocabulary import UNITS_M
 
 from ...clouds.recording import Recording, SeveralSensorsError
@@ -121,6 +123,14 @@ class SurveyCloud:
         system = self.recordings[0].system
         return None if system is None else system.name
 
+    @cached_property
+    def vertical_datum(self) -> str:
+        """Name of the datum of heights, or an empty string if the file does not state it."""
+        system = self.recordings[0].system
+        if system is None:
+            return "" if self.epsg is None else StatedSystem(f"EPSG:{self.epsg}").vertical_datum
+        return system.vertical_datum
+
     @property
     def unit_name(self) -> str:
         """Name of the length unit of the file."""
@@ -224,12 +234,38 @@ def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
                 "`--unit-a` and `--unit-b` if their origins and axes are the same."
             )
     stated = sorted({cloud.system_name for cloud in clouds if cloud.system_name})
+    notes = _height_notes(clouds)
+    if stated:
+        notes += [
+            f"{cloud.name} does not specify a coordinate system and is assumed to be in {stated[0]}"
+            for cloud in clouds
+            if cloud.system_name is None
+        ]
+    return notes
+
+
+def _height_notes(clouds: Sequence[SurveyCloud]) -> list[str]:
+    """Return notes about clouds that do not specify a vertical datum although others do.
+
+    Raise LidarError if clouds state different vertical datums.
+    """
+    stated = [cloud for cloud in clouds if cloud.vertical_datum]
     if not stated:
         return []
+    first, *others = stated
+    heights = describe_heights(first.vertical_datum)
+    for other in others:
+        if not same_vertical_datum(first.vertical_datum, other.vertical_datum):
+            raise LidarError(
+                f"{first.name} has {heights}, but {other.name} has "
+                f"{describe_heights(other.vertical_datum)}. Transform one of them first, for "
+                "example with filters.reprojection of PDAL and a geoid grid."
+            )
     return [
-        f"{cloud.name} does not specify a coordinate system and is assumed to be in {stated[0]}"
+        f"{cloud.name} does not specify a vertical datum, and its heights are assumed to be "
+        f"{heights}"
         for cloud in clouds
-        if cloud.system_name is None
+        if not cloud.vertical_datum
     ]
 
 

@@ -33,6 +33,7 @@ _UTM_MIDDLE_M = 500_000.0  # easting of the central meridian
 _UTM_HALF_WIDTH_M = 900_000.0  # at this distance from it, the length error is 0.96 %
 _GROUND_STEP_M = 10.0  # step of the finite differences from which scales are computed
 _BLOCK_POINTS = 100_000  # points transformed at a time, since rasterio uses Python lists
+ELLIPSOID = "ellipsoid"  # vertical datum of ellipsoidal heights
 UNNAMED = ("unnamed", "unknown", "")  # names that GDAL and PROJ use for systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, north and south
 _POLAR_DEG = 84.0  # from this latitude on, universal polar stereographic replaces UTM
@@ -210,6 +211,34 @@ def horizontal_part(crs: Any) -> tuple[Any, float | None]:
     if not units:
         return horizontal, None
     return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
+
+
+def vertical_datum(crs: Any) -> str:
+    """Return the name of the vertical datum of a coordinate system.
+
+    The result is `ELLIPSOID` for heights above the ellipsoid, and an empty string if the system
+    states no datum. Systems with different units can have the same datum.
+    """
+    described = projjson(crs)
+    parts = [_unbound(part) for part in described.get("components", [described])]
+    for part in parts:
+        if part["type"] == "VerticalCRS":
+            name = str((part.get("datum") or part.get("datum_ensemble") or {}).get("name", ""))
+            return "" if name.lower() in UNNAMED else name[:80]
+    directions = [axis["direction"] for axis in parts[0]["coordinate_system"]["axis"]]
+    has_heights = parts[0]["type"] != "EngineeringCRS" and "up" in directions
+    return ELLIPSOID if has_heights or is_geocentric(crs) else ""
+
+
+def describe_heights(datum: str) -> str:
+    """Return words for heights in a vertical datum, as returned by `vertical_datum`."""
+    return "ellipsoidal heights" if datum == ELLIPSOID else f"heights in the datum {datum}"
+
+
+def same_vertical_datum(a: str, b: str) -> bool:
+    """Return whether two names denote the same vertical datum."""
+    first, second = (re.sub("[^a-z0-9]", "", name.lower()) for name in (a, b))
+    return first == second
 
 
 def is_local(crs: Any) -> bool:

@@ -85,6 +85,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     if content.generator == GENERATOR and isinstance(extras, dict):
         epsg = extras.get("epsg")
         content.epsg = epsg if type(epsg) is int else None
+        content.vertical_datum = str(extras.get("vertical_datum", ""))
     return content
 
 

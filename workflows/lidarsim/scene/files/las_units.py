@@ -16,7 +16,14 @@ from typing import NamedTuple
 from ...environment.extras import install_command
 from ...errors import CutShortError, LidarError
 from ...schema.vocabulary import UNITS_M
-from .coordinate_systems import UTM_EPSG, crs_from_code, has_registry
+from .coordinate_systems import (
+    ELLIPSOID,
+    UNNAMED,
+    UTM_EPSG,
+    crs_from_code,
+    has_registry,
+    vertical_datum,
+)
 
 # Record numbers of LASF_Projection in ASPRS LAS 1.4, which are also TIFF tags
 GEO_KEYS = 34735
@@ -80,6 +87,8 @@ _UNIT_NAMES = {  # as spelled in files, but in lower case and with spaces instea
     **dict.fromkeys(("mile", "miles"), 1609.344),
 }
 _DATUMS = range(5001, 5300)  # GeoTIFF 1.0 uses datums, which have no unit, as vertical systems
+_ELLIPSOIDS = range(5001, 5100)  # the part of `_DATUMS` that denotes ellipsoidal heights
+_DATUM_SYSTEMS = range(5101, 5107)  # datums whose vertical systems have codes that differ by 600
 # All commands and functions that read clouds have a unit option, but compare reads two clouds.
 _OVERRIDE = (
     "Specify the unit with --unit, or with --unit-a and --unit-b for compare (unit=, unit_a= and "
@@ -169,7 +178,10 @@ _HORIZONTAL = {
     "ENGINEERINGCRS",
     "DERIVEDPROJCRS",
 }
+_LOCAL = {"LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"}
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
+_VERTICAL_DATUMS = {"VERT_DATUM", "VDATUM", "VRF", "VERTICALDATUM", "ENSEMBLE"}
+_ELLIPSOIDAL = "2002"  # type of a vertical datum in OGC WKT 1
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
 _BOUND = {"BOUNDCRS"}
@@ -242,6 +254,25 @@ def wkt_code(text: str) -> int | None:
         if code and len(code.values) > 1 and code.values[0].upper() == "EPSG":
             return int(code.values[1]) if code.values[1].isdecimal() else None
     return None
+
+
+def wkt_vertical_datum(text: str) -> str:
+    """Return the name of the vertical datum in WKT, as `vertical_datum` does for a known system.
+
+    Raises
+    ------
+    ValueError
+        If the text is not valid WKT.
+    """
+    _, parts = _parse_systems(text)
+    if vertical := next((part for part in parts if part.keyword in _VERTICAL), None):
+        datum = vertical.child(_VERTICAL_DATUMS) or _Node("")
+        name, kind = [*datum.values, "", ""][:2]
+        if kind == _ELLIPSOIDAL or name.lower() == ELLIPSOID:
+            return ELLIPSOID
+        return "" if name.lower() in UNNAMED else name[:80]
+    projected = (part for part in parts if part.keyword in _HORIZONTAL - _LOCAL)
+    return ELLIPSOID if any(map(_third_unit, projected)) else ""
 
 
 def _parse_systems(text: str) -> tuple[_Node, list[_Node]]:
@@ -382,6 +413,21 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
     return CoordinateUnits(unit, heights)
+
+
+def vertical_datum_of_keys(keys: Mapping[int, float]) -> str:
+    """Return the name of the vertical datum in GeoTIFF keys, as `vertical_datum` does.
+
+    Without rasterio, the result contains the EPSG code of the vertical system instead of a name.
+    """
+    code = int(keys.get(_VERTICAL_CRS, 0))
+    if code in _ELLIPSOIDS:
+        return ELLIPSOID
+    code += 600 if code in _DATUM_SYSTEMS else 0
+    if code in (0, USER_DEFINED):
+        return ""
+    crs = crs_from_code(code) if has_registry() else None
+    return f"EPSG:{code}" if crs is None else vertical_datum(crs)
 
 
 def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:

@@ -134,6 +134,7 @@ class Objects(NamedTuple):
     ] = {}  # {ASPRS LAS class number: class}, if objects have types
     is_landscape: bool = False  # whether the file represents terrain rather than an object
     epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
+    vertical_datum: str = ""  # name of the datum of heights, if the file states it
     frames: ObjectFrames | None = None  # frames of `static`, or None if the format has none
 
     def at_start(self, report: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
@@ -221,15 +222,23 @@ def load_objects(
         and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
     ):
         _report_axes(path, content, meshes, axes)
-    epsg = content.epsg or _stated_epsg(data[:_HEAD_BYTES])
+    epsg, datum = _stated_system(data[:_HEAD_BYTES])
+    epsg = content.epsg or epsg
+    datum = content.vertical_datum or datum
     if content.raster is not None:
         epsg = content.raster.epsg
     if unit_m != (content.unit_m or 1.0) or axis != (content.up_axis or "z"):
         epsg = None
+        datum = ""
     if shared.transform is not None and not shared.transform.keeps_xy:
         epsg = None
+    if shared.transform is not None and not shared.transform.keeps_z:
+        datum = ""
     objects = objects._replace(
-        classes=content.classes, is_landscape=content.is_landscape, epsg=epsg
+        classes=content.classes,
+        is_landscape=content.is_landscape,
+        epsg=epsg,
+        vertical_datum=datum,
     )
     if content.raster is not None:
         return objects._replace(summary=content.raster.summary, raster=content.raster)
@@ -348,10 +357,17 @@ def is_written_by_lidarpool(path: Path) -> bool:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
 
 
-def _stated_epsg(head: bytes) -> int | None:
-    """Return the EPSG code in the header comments of a file written by lidarpool, or None."""
-    match = re.search(re.escape(FORMAT_COMMENT.encode()) + rb"\n\S+ crs: EPSG:(\d+)", head)
-    return int(match[1]) if match else None
+def _stated_system(head: bytes) -> tuple[int | None, str]:
+    """Return the EPSG code and the vertical datum in the comments of a file from lidarpool.
+
+    They are None and an empty string if the file does not state them.
+    """
+    system = rb"(?:\n\S+ crs: EPSG:(\d+))?(?:\n\S+ vertical datum: ([^\n]+))?"
+    match = re.search(re.escape(FORMAT_COMMENT.encode()) + system, head)
+    if match is None:
+        return None, ""
+    epsg = int(match[1]) if match[1] else None
+    return epsg, (match[2] or b"").decode("ascii", "replace").strip()
 
 
 def _report_axes(

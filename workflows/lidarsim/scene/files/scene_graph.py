@@ -125,6 +125,7 @@ class Content:
     notes: list[str] = field(default_factory=list)  # clauses that follow the name of the file
     raster: Raster | None = None
     epsg: int | None = None  # code of the coordinate system in meters, if the file states it
+    vertical_datum: str = ""  # name of the datum of heights, if the file states it
     is_landscape: bool = False  # whether the file represents terrain rather than an object
     # {ASPRS LAS class number: class}, for formats in which objects have types
     classes: Mapping[int, ObjectClass] = field(default_factory=dict)

@@ -41,6 +41,7 @@ from .coordinate_systems import (
     suggested_epsg,
     target_problem,
     transform_coordinates,
+    vertical_datum,
 )
 from .las_units import (
     GEO_DOUBLES,
@@ -56,9 +57,11 @@ from .las_units import (
     reprojection_advice,
     units_of_epsg,
     units_of_keys,
+    vertical_datum_of_keys,
     wkt_code,
     wkt_method,
     wkt_units,
+    wkt_vertical_datum,
 )
 
 WKT_RECORD = 2112  # record number of LASF_Projection in ASPRS LAS 1.4
@@ -263,6 +266,18 @@ class StatedSystem:
             )
             return float(meters), note if meters != 1 else ""
         return 1.0, "does not state a unit for heights, which are assumed to be in meters"
+
+    @cached_property
+    def vertical_datum(self) -> str:
+        """Name of the vertical datum, as returned by the function `vertical_datum`."""
+        if not self.text:
+            return vertical_datum_of_keys(self._keys)
+        if self.crs is not None:
+            return vertical_datum(self.crs)
+        try:
+            return "" if self._is_code else wkt_vertical_datum(self.text)
+        except ValueError:  # text that is not WKT is ignored if the user specifies the unit
+            return ""
 
     @property
     def name(self) -> str:
