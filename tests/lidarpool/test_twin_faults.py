@@ -24,7 +24,8 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.folder import result_folder
 from lidarpool.reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps, TwinStep
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.run.cluster.worker_map import LostWorkersError, parallel_map
+from lidarpool.work.lost_workers import LostWorkersError
+from lidarpool.work.mapping import parallel_map
 
 pytest.importorskip("scipy")
 
@@ -166,15 +167,6 @@ def test_an_error_of_a_worker_is_no_lost_cluster():
         pytest.raises(OSError, match="no such file"),
     ):
         list(run(fail, [2]))
-
-
-@pytest.mark.slow
-def test_a_submap_that_kills_its_workers_is_one_sentence():
-    with (
-        parallel_map(None, 2, 1, workers=2) as run,
-        pytest.raises(LostWorkersError, match="Several workers ended while they processed the"),
-    ):
-        list(run(os._exit, [1, 1]))
 
 
 @pytest.mark.extended

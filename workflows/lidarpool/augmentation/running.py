@@ -24,7 +24,7 @@ from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.software import software
-from ..run.cluster.worker_map import MapFunction, parallel_map
+from ..work.mapping import MapFunction, parallel_map
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
     CHECKED_SENSORS,

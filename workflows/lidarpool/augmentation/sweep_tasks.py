@@ -29,6 +29,7 @@ from ..clouds.recording import METERS, Recording, RecordingSource, SeveralSensor
 from ..clouds.writing import ExportSpec
 from ..processes.per_process import PerProcess
 from ..recordings.opening import open_recording
+from ..work.mapping import describe_sweeps
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
 from .conversion import FormatConverter
@@ -163,6 +164,11 @@ class SweepTask(NamedTuple):
 
     shared: SharedPlan
     sweeps: tuple[PlannedSweep, ...]
+
+    @property
+    def label(self) -> str:
+        """Sweeps of the task, for messages."""
+        return describe_sweeps(self.sweeps[0].number, self.sweeps[-1].number)
 
 
 class EncodedFiles(NamedTuple):

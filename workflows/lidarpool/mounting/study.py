@@ -21,10 +21,10 @@ from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
 from raybeam import RayCaster
 
-from ..run.cluster.worker_map import parallel_map
 from ..scenario.mount_sections import MAX_CELLS, BodyPart, VehicleFile
 from ..scenario.sections import ShapeSection
 from ..scenario.static_scene import FileFindings, ShapeLoader
+from ..work.mapping import parallel_map
 from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements

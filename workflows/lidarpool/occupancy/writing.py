@@ -20,12 +20,12 @@ from lidarsim.words import join_names
 
 from ..clouds.cloud_format import Entry
 from ..clouds.folder import check_not_existing
-from ..run.cluster.worker_map import parallel_map
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
+from ..work.mapping import describe_sweeps, parallel_map
 from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:
@@ -93,6 +93,11 @@ class _Task(NamedTuple):
     number: int | None  # job of a campaign, or None for a scenario
     settings: OccupancySettings
     sweeps: range
+
+    @property
+    def label(self) -> str:
+        """Sweeps of the task, for messages."""
+        return describe_sweeps(self.sweeps[0], self.sweeps[-1])
 
 
 @dataclass(frozen=True)

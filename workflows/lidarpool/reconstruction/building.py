@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from distributed import Client
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
@@ -33,7 +32,8 @@ from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.lidar4d import WINDOWS
 from ..recordings.opening import open_recording
-from ..run.cluster.worker_map import LostWorkersError, MapFunction, parallel_map
+from ..work.lost_workers import LostWorkersError
+from ..work.mapping import MapFunction, parallel_map
 from .air_returns import AirStatistics
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import (
@@ -75,6 +75,9 @@ from .twin import NO_RETURN, Twin
 from .vehicle_detection import find_poses_and_vehicle
 from .vehicle_returns import VehicleReturns
 from .visibility import estimate_visibility
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 ActorSource = Literal["boxes", "clusters", "none"]
 MIN_SWEEPS = 4

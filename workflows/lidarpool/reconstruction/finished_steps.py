@@ -24,7 +24,7 @@ from lidarsim.errors import LidarError, explain_os_errors
 from ..identity.fingerprint import fingerprint
 
 if TYPE_CHECKING:
-    from ..run.cluster.worker_map import MapFunction
+    from ..work.mapping import MapFunction
 
 STEPS_FOLDER = ".lidarpool-twin"
 _OF_FILE = "of.json"  # identifies the inputs of the steps

@@ -12,6 +12,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
+from ..work.mapping import describe_sweeps
 from .air_returns import AirStatistics, find_air_returns
 from .alignment import AlignedSweeps, Alignment, align
 from .charts import SweepImages, TopViewPoints
@@ -50,6 +51,11 @@ class SubmapTask:
     alignment: Alignment
     submap: Submap
     mapped: Ints
+
+    @property
+    def label(self) -> str:
+        """Sweeps of the submap, for messages."""
+        return describe_sweeps(int(self.submap.numbers[0]), int(self.submap.numbers[-1]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from typing import Any, Self
 
 from distributed import Client, get_worker
-from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
 from lidarsim.errors import LidarError
 from lidarsim.simulator.casting.scene_caster import check_backend_here
-from poolpart import Partition, PipeClosed, PipeFailed, PoolError
+from poolpart import Partition, PoolError
 from poolpart.task_context import own_client
 
 from ...processes import timeline
 from ...scenario.job import Job
+from ...work.cluster_map import CLUSTER_LOST, is_connection_lost
 from ..job_source import Jobs
 from ..options import RunOptions
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
@@ -34,11 +33,6 @@ from .connection import (
 from .requirements import slots_needed
 from .tasks import TaskGroup
 from .watch import WaitTimer, Watch
-
-LOST_S = 0.5  # time until a client notices that its scheduler is lost
-
-# Errors that Dask raises after the scheduler is lost. Connection errors are OSErrors.
-_CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 class ClusterConnection:
@@ -274,7 +268,7 @@ class Cluster:
             yield
         finally:
             if self.client.status == "running":
-                with suppress(PoolError, *_CLUSTER_LOST):
+                with suppress(PoolError, *CLUSTER_LOST):
                     self._workers.pool.leave_page()
 
     @contextmanager
@@ -294,24 +288,8 @@ class Cluster:
                 raise
             if isinstance(error, PoolError) and not lost:
                 raise LidarError(str(error)) from error
-            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
+            if isinstance(error, CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise self._lost_error() from error
             raise
         finally:
             self._release_slots()
-
-
-def is_connection_lost(client: Client, error: BaseException) -> bool:
-    """Return True if the connection of a client to its scheduler is lost.
-
-    Requests may fail shortly before the client notices the loss. If `error` suggests a lost
-    scheduler, wait up to `LOST_S` seconds for the client to notice.
-    """
-    deadline = time.monotonic() + LOST_S
-    while (
-        client.status == "running"
-        and isinstance(error, _CLUSTER_LOST)
-        and time.monotonic() < deadline
-    ):
-        time.sleep(0.01)
-    return client.status != "running"
