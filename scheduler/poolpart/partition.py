@@ -514,6 +514,7 @@ class Partition:
         futures: Future | Iterable[Future],
         *,
         running: Literal["continue", "restart"] = "continue",
+        recompute: bool = False,
     ) -> dict[Any, str]:
         """Cancel tasks of this partition, and return the outcome for each task.
 
@@ -526,25 +527,33 @@ class Partition:
             How to handle tasks that are already running. With "continue", they keep their slots
             until their functions return, because Dask does not stop running functions. The
             functions can check `cancelled` to return early. With "restart", the nanny restarts each
-            worker that runs only these tasks, and the worker returns to the partition. A worker is
-            not restarted if it has another task, an actor, or the only copy of a result, or if it
-            does not respond within 5 s, for example because a function holds the global interpreter
-            lock. The call returns after at most 80 s, even if a restarted worker has not rejoined.
+            worker that runs only these tasks, and the worker returns to the partition. Its waiting
+            tasks and its results move to other workers of the partition. A worker is not restarted
+            if it runs another task, if it holds an actor or a result that cannot be copied, or if a
+            waiting task may only run there. This also applies to a worker that does not respond
+            within 5 s, for example because a function holds the global interpreter lock. If it is
+            not restarted, it receives no tasks until it responds. The call returns after at most
+            100 s, even if a restarted worker has not rejoined.
+        recompute
+            Whether workers may also be restarted if they run other tasks, or hold results that
+            cannot be copied. These tasks run again. Scattered data cannot be computed again, so
+            its worker is not restarted.
 
         Returns
         -------
         dict
             Mapping of task keys to strings that begin with one of the following words.
             ``cancelled``: the task will not run. ``ended``: the task had already finished, and its
-            result was released. ``running: …``: the task is still running, or may be running on a
-            worker that does not respond. The string names the worker and the reason why it was not
-            restarted. ``restarted: …``: the task's worker was restarted. ``kept: …``: another
-            client needs the task's result.
+            result was released, or its function has returned since it was canceled. ``running:
+            …``: the task is still running, or may be running on a worker that does not respond. The
+            string names the worker and the reason why it was not restarted. ``restarted: …``: the
+            task's worker was restarted. ``kept: …``: another client needs the task's result.
 
         Raises
         ------
         ValueError
-            If `running` is neither "continue" nor "restart".
+            If `running` is neither "continue" nor "restart", or if `recompute` is used without
+            "restart".
         PoolError
             If a task belongs to another partition. In this case, no task is canceled.
 
@@ -559,6 +568,8 @@ class Partition:
             raise ValueError(
                 f'Invalid value {running!r} for `running`. Expected "continue" or "restart".'
             )
+        if recompute and running != "restart":
+            raise ValueError('`recompute` requires `running="restart"`.')
         tasks = {}
         for task in [futures] if isinstance(futures, Future) else futures:
             if not isinstance(task, Future):
@@ -568,7 +579,7 @@ class Partition:
             key: "ended" if task.status in ("finished", "error") else "cancelled"
             for key, task in tasks.items()
         }
-        outcomes |= cancel_tasks(tasks, self.client, self.name, running == "restart")
+        outcomes |= cancel_tasks(tasks, self.client, self.name, running == "restart", recompute)
         self.client.cancel(
             [task for key, task in tasks.items() if not outcomes[key].startswith("kept")]
         )

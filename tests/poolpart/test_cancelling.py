@@ -124,7 +124,7 @@ def test_a_worker_with_another_task_or_result_is_not_restarted(processes, event,
     first = io.submit(until_cancelled, *names[:2])
     assert Event(names[0], processes).wait(LONG_S)
     release = event(processes)
-    reason = "running: worker IO-0 holds other tasks or results"
+    reason = "running: worker IO-0 runs other tasks"
     other = io.submit(wait_for, release.name)
     wait_until(lambda: io.stats().running == 2)
     assert io.cancel(first, running="restart") == {first.key: reason}
@@ -132,6 +132,7 @@ def test_a_worker_with_another_task_or_result_is_not_restarted(processes, event,
     assert other.result(LONG_S) is True  # this result is on no further worker
     second = io.submit(until_cancelled, *names[2:])
     assert Event(names[2], processes).wait(LONG_S)
+    reason = "running: worker IO-0 holds the only copy of a result"
     assert io.cancel(second, running="restart") == {second.key: reason}
     assert Event(names[3], processes).wait(LONG_S)
     assert other.result(LONG_S) is True
@@ -142,21 +143,74 @@ def get_name():
     return get_worker().name
 
 
-def test_a_worker_that_does_not_answer_is_not_restarted(processes, event, monkeypatch):
-    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 0.1)
-    gpu = Partition("GPU", processes)
-    pid = gpu.submit(os.getpid).result(LONG_S)
-    started, ended = event(processes), event(processes)
-    future = gpu.submit(until_cancelled, started.name, ended.name)
+def test_what_a_worker_runs_and_holds_is_computed_again_if_allowed(processes, event, wait_until):
+    io = Partition("IO", processes)
+    held = io.submit(os.getpid)
+    pid = held.result(LONG_S)
+    [data] = io.scatter([1])
+    started, release = event(processes), event(processes)
+    hung = io.submit(sleep_long, started.name)
+    other = io.submit(wait_for, release.name)
     assert started.wait(LONG_S)
+    wait_until(lambda: io.stats().running == 2)
+    reason = "running: worker IO-0 holds the only copy of scattered data"
+    assert io.cancel(hung, running="restart", recompute=True) == {hung.key: reason}
+    data.release()
+    wait_until(lambda: data.key not in processes.who_has())
+    again = {"running": "restart", "recompute": True}
+    assert io.cancel(hung, **again) == {hung.key: "restarted: worker IO-0"}
+    release.set()
+    assert other.result(LONG_S) is True
+    assert processes.submit(abs, held, pure=False).result(LONG_S) != pid  # computed again
+    with pytest.raises(ValueError, match='`recompute` requires `running="restart"`'):
+        io.cancel(held, recompute=True)
+
+
+@pytest.mark.extended(every=2)
+@pytest.mark.parametrize("responds", [True, False])
+def test_waiting_tasks_and_results_move_to_another_worker(nannies, event, monkeypatch, responds):
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 2.0 if responds else 0.2)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    one, other = both_names(both)
+    pid = both.submit(os.getpid, workers=one).result(LONG_S)
+    held = None if not responds else both.submit(os.urandom, 8)
+    value = held and held.result(LONG_S)
+    started, release = event(nannies), event(nannies)
+    hung = both.submit(sleep_long, started.name, workers=one)
+    blocked = both.submit(wait_for, release.name, workers=other)
+    assert started.wait(LONG_S)
+    waiting = [both.submit(abs, number) for number in range(10)]
+    if not responds:
+        os.kill(pid, signal.SIGSTOP)
+    release.set()
+    assert both.cancel(hung, running="restart") == {hung.key: f"restarted: worker {one}"}
+    assert nannies.gather(waiting) == [*range(10)] and blocked.result(LONG_S)
+    assert held is None or nannies.submit(bytes, held).result(LONG_S) == value
+
+
+def test_a_worker_that_cannot_be_restarted_gets_no_tasks_until_it_responds(
+    nannies, event, monkeypatch
+):
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 0.2)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    one, other = both_names(both)
+    held = both.submit(os.getpid, workers=one)
+    pid = held.result(LONG_S)
+    started, ended = event(nannies), event(nannies)
+    future = both.submit(until_cancelled, started.name, ended.name, workers=one)
+    assert started.wait(LONG_S)
+    waiting = [both.submit(get_name) for _ in range(6)]
     os.kill(pid, signal.SIGSTOP)
     try:
-        outcomes = gpu.cancel(future, running="restart")
+        outcomes = both.cancel(future, running="restart")
+        reason = f"running: worker {one} does not respond and holds the only copy of a result"
+        assert outcomes == {future.key: reason}
+        assert {str(name) for name in nannies.gather(waiting)} == {other}
+        assert str(both.submit(get_name).result(LONG_S)) == other
     finally:
         os.kill(pid, signal.SIGCONT)
-    assert outcomes == {future.key: "running: worker GPU-0 does not respond"}
     assert ended.wait(LONG_S)
-    assert gpu.submit(os.getpid).result(LONG_S) == pid
+    assert both.submit(os.getpid, workers=one).result(LONG_S) == pid
 
 
 @pytest.mark.extended
@@ -172,16 +226,14 @@ def test_each_of_many_tasks_is_accounted_for_beside_a_worker_that_does_not_answe
         running[name] = both.submit(sleep_long, started.name, workers=name)
         assert started.wait(LONG_S)
     waiting = [both.submit(abs, number) for number in range(18)]
-    silent, restarted = running
+    silent, _ = running
     os.kill(pids[silent], signal.SIGSTOP)
-    try:
-        outcomes = both.cancel([*running.values(), *waiting], running="restart")
-    finally:
-        os.kill(pids[silent], signal.SIGKILL)
-    assert outcomes[running[restarted].key] == f"restarted: worker {restarted}"
-    assert outcomes[running[silent].key] == f"running: worker {silent} does not respond"
+    outcomes = both.cancel([*running.values(), *waiting], running="restart")
     unknown = {outcomes[task.key] for task in waiting}
-    assert unknown <= {"cancelled", f"running: worker {silent} does not respond"}
+    assert unknown <= {"cancelled", f"restarted: worker {silent}"}
+    assert [outcomes[task.key] for task in running.values()] == [
+        f"restarted: worker {name}" for name in running
+    ]
     assert len(outcomes) == 20
     assert both.submit(pow, 2, 10).result(LONG_S) == 1024
 

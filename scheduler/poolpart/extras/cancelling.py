@@ -1,16 +1,17 @@
 """Cancel tasks, including tasks that are already running.
 
 Dask does not stop a running function. Its thread continues and keeps the task's slot. The function
-can check `cancelled`, or the worker process can be restarted if nothing else would be lost. The
-scheduler decides this in two steps, as for idle workers in `adapting.py`: it stops assigning tasks
-to the worker, and then asks the worker which tasks it runs.
+can check `cancelled`, or the worker process can be restarted if nothing else would be lost
+(`free_worker`): the scheduler stops assigning tasks to the worker, moves waiting tasks and results
+to other workers, and asks the worker which tasks it runs. A worker that does not respond cannot
+hand anything over, so its waiting tasks are assigned again.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Collection, Coroutine, Iterable, Mapping
+from collections.abc import Collection, Coroutine, Mapping, Set
 from typing import Any, NamedTuple, TypeVar
 
 from distributed import Client, Future, Status
@@ -20,10 +21,15 @@ from ..fetch import holds_bytes
 from ..internals.scheduler import (
     call_worker,
     cancel_keys,
-    holds_nothing,
+    copy_results,
+    hand_off_tasks,
+    is_bound,
+    only_copies,
     requires_any,
+    reschedule_tasks,
     restart_worker,
     resume_assigning,
+    running_candidates,
     stop_assigning,
 )
 from ..internals.worker import current_task, running_keys
@@ -35,7 +41,10 @@ Outcomes = dict[Any, str]  # {task key: outcome}
 
 ARRIVAL_S = 1.0  # time for submitted tasks to arrive, which use another connection
 ANSWER_S = 5.0  # time for a worker to respond, which a function that holds the GIL can delay
+MOVE_S = 1.0  # time for a worker to hand its waiting tasks over
+COPY_S = 10.0  # time to copy the results of a worker to other workers
 RESTART_S = 60.0  # time for a restarted worker to rejoin
+_CHECK_S = 0.5  # interval between requests to a worker whose tasks are awaited
 
 
 def cancelled() -> bool:
@@ -56,12 +65,13 @@ def cancelled() -> bool:
 
 
 def cancel_tasks(
-    tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
+    tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool, recompute: bool
 ) -> Outcomes:
     """Cancel tasks of a partition on the scheduler, and return the outcome for each key.
 
     Tasks that had not started or had already finished are omitted from the result. If `restarts` is
-    true, workers that only run these tasks are restarted.
+    true, workers that only run these tasks are restarted. If `recompute` is true, they may also run
+    other tasks, and have results that cannot be copied, all of which are computed again.
 
     Raises
     ------
@@ -76,6 +86,7 @@ def cancel_tasks(
         name=name,
         client_id=client.id,
         restarts=restarts,
+        recompute=recompute,
     )
     if complaint:
         raise PoolError(complaint)
@@ -88,6 +99,7 @@ async def _cancel_tasks(
     name: str,
     client_id: str,
     restarts: bool,
+    recompute: bool,
     dask_scheduler: Any = None,
 ) -> tuple[Outcomes, str]:
     """Cancel tasks, and return their outcomes. If this is not possible, return an error message."""
@@ -99,51 +111,154 @@ async def _cancel_tasks(
     for key, task in known.items():
         if not requires_any(task, [name]):
             return {}, f"Task {key!r} does not belong to partition {name!r}. No task was canceled."
-    workers = {key: task.processing_on for key, task in known.items()}
     annotations = {key: task.annotations for key, task in known.items()}
+    members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
+    candidates = {worker: {task.key for task in running_candidates(worker)} for worker in members}
     cancel_keys(scheduler, keys, client_id)
     kept = [key for key in known if key in scheduler.tasks]
     outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
-    members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
     loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
-    affected: dict[Any, list[Any]] = {}  # {worker: keys of canceled tasks that it runs}
-    for worker, load in zip(members, loads, strict=True):
-        if load is None:  # a canceled task may prevent the worker from responding
-            silent = [key for key, at in workers.items() if at is worker and key not in outcomes]
-            outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not respond")
-        elif running := [key for key in load.running if key in keys and key not in outcomes]:
-            affected[worker] = running
-    ends = (
-        _restart_if_idle(scheduler, worker, running, restarts)
-        for worker, running in affected.items()
-    )
-    for running, outcome in zip(affected.values(), await asyncio.gather(*ends), strict=True):
-        outcomes |= dict.fromkeys(running, outcome)
+
+    async def end(worker: Any, load: _Load | None) -> None:
+        # A canceled task may prevent its worker from responding.
+        running = candidates[worker] if load is None else load.running
+        found = [key for key in running if key in keys and key not in kept]
+        if not found:
+            return
+        outcome = f"running: worker {worker.name}{' does not respond' if load is None else ''}"
+        if restarts:
+            ended, others = {*found}, candidates[worker]
+            outcome = await free_worker(scheduler, worker, name, ended, others, recompute=recompute)
+        outcomes.update(dict.fromkeys(found, outcome))
         if outcome.startswith("restarted"):
-            for key in running:
+            for key in found:
                 fail_pipes_of_killed_task(scheduler, key, annotations.get(key))
+
+    await asyncio.gather(*map(end, members, loads))
     return outcomes, ""
 
 
-async def _restart_if_idle(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
-    """Restart a worker if all of its tasks were canceled, and return the outcome."""
-    still_running = f"running: worker {worker.name}"
-    if not restarts:
-        return still_running
-    if not worker.nanny:
-        return f"{still_running} has no nanny to restart it"
+async def free_worker(
+    scheduler: Any,
+    worker: Any,
+    name: str,
+    ended: Set[Any],
+    candidates: Set[Any],
+    *,
+    recompute: bool = False,
+    patience_s: float = 0.0,
+) -> str:
+    """Restart a worker to free the slots of tasks that do not end, and return the outcome.
+
+    The worker is not restarted if it runs other tasks, or if data would be lost. Its waiting tasks
+    run on other workers in any case.
+
+    Parameters
+    ----------
+    scheduler, worker
+        Their states.
+    name
+        Partition of the worker.
+    ended
+        Keys of the tasks, which have already ended for the scheduler.
+    candidates
+        Keys of all tasks that the worker may have been running, if it does not respond.
+    recompute
+        Whether other running tasks and results that cannot be copied may be computed again.
+    patience_s
+        Time in seconds to wait until other running tasks have finished.
+    """
+    running = f"running: worker {worker.name}"
     if worker.status is not Status.running:
-        return f"{still_running} is {worker.status.name}"
-    # No task can arrive in between, because the event loop has not run since the checks above.
+        return f"{running} is {worker.status.name}"
     stop_assigning(scheduler, worker)
-    load = await _load(scheduler, worker)
-    alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
-    if not alone or not holds_nothing(scheduler, worker):
+    load = await _hand_over(scheduler, worker, name, candidates)
+    deadline = time.monotonic() + patience_s
+    while load is not None and ended < {*load.running} and time.monotonic() < deadline:
+        await asyncio.sleep(_CHECK_S)
+        load = await _load(scheduler, worker)
+    if load is not None and ended.isdisjoint(load.running):
         resume_assigning(scheduler, worker)
-        return f"{still_running} holds other tasks or results"
+        return "ended"
+    if obstacle := await _obstacle(scheduler, worker, name, load, ended, candidates, recompute):
+        if load is None:
+            _start(_resume_when_responding(scheduler, worker))
+        else:
+            resume_assigning(scheduler, worker)
+        return running + obstacle
+    # Dask would count the death of the worker against these tasks.
+    reschedule_tasks(scheduler, list(worker.processing))
     if await _await_for(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
+
+
+async def _hand_over(scheduler: Any, worker: Any, name: str, candidates: Set[Any]) -> _Load | None:
+    """Move a worker's waiting tasks to other workers, and return its load afterwards."""
+    load = await _load(scheduler, worker)
+    if load is None:
+        waiting = [task for task in worker.processing if task.key not in candidates]
+        reschedule_tasks(scheduler, [task for task in waiting if not is_bound(task)])
+        return None
+    hand_off_tasks(scheduler, worker, {name}, set())
+    deadline = time.monotonic() + MOVE_S
+    while time.monotonic() < deadline and any(
+        task.key not in load.running and not is_bound(task) for task in worker.processing
+    ):
+        await asyncio.sleep(0.01)
+    return await _load(scheduler, worker)
+
+
+async def _obstacle(
+    scheduler: Any,
+    worker: Any,
+    name: str,
+    load: _Load | None,
+    ended: Set[Any],
+    candidates: Set[Any],
+    recompute: bool,
+) -> str:
+    """Return why a worker must not be restarted, or "". Results are copied to other workers."""
+    silent = " does not respond" if load is None else ""
+    joined = f"{silent} and" if silent else ""
+    running = candidates if load is None else {*load.running}
+    if not worker.nanny:
+        return f"{joined} has no nanny to restart it"
+    if running - ended and not recompute:
+        return f"{joined} runs other tasks"
+    if any(map(is_bound, worker.processing)):
+        return f"{joined} has tasks that may only run there"
+    if worker.actors:
+        return f"{joined} holds an actor"
+    if load is not None and load.holds_results:
+        return " holds results that have not been fetched"
+    if load is not None and only_copies(worker):
+        await _await_for(copy_results(scheduler, [worker], name), COPY_S)
+    lost = only_copies(worker)
+    if any(task.run_spec is None for task in lost):
+        return f"{joined} holds the only copy of scattered data"
+    if lost and not recompute:
+        return f"{joined} holds the only copy of a result"
+    return ""
+
+
+async def _resume_when_responding(scheduler: Any, worker: Any) -> None:
+    """Assign tasks to a worker again as soon as it responds."""
+    while scheduler.workers.get(worker.address) is worker:
+        if await _load(scheduler, worker) is not None:
+            resume_assigning(scheduler, worker)
+            return
+        await asyncio.sleep(_CHECK_S)
+
+
+_background: set[asyncio.Task[None]] = set()
+
+
+def _start(coroutine: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine in the background."""
+    task = asyncio.ensure_future(coroutine)
+    _background.add(task)
+    task.add_done_callback(_background.discard)
 
 
 class _Load(NamedTuple):

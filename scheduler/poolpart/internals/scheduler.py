@@ -227,7 +227,12 @@ def holds_nothing(scheduler: Any, worker: Any) -> bool:
     moves = stealing.in_flight.values() if stealing else ()
     if any(move["thief"] is worker for move in moves):  # a task is being moved to the worker
         return False
-    return all(len(task.who_has) > 1 for task in worker.has_what)
+    return not only_copies(worker)
+
+
+def only_copies(worker: Any) -> list[Any]:
+    """Return the tasks whose results only this worker holds."""
+    return [task for task in worker.has_what if len(task.who_has) == 1]
 
 
 async def copy_results(scheduler: Any, workers: Collection[Any], name: str) -> None:
@@ -238,12 +243,7 @@ async def copy_results(scheduler: Any, workers: Collection[Any], name: str) -> N
     """
     members = (worker for worker in scheduler.running if worker.resources.get(name))
     others = [worker for worker in members if worker not in workers]
-    holders = {
-        task.key: [worker.address]
-        for worker in workers
-        for task in worker.has_what
-        if len(task.who_has) == 1
-    }
+    holders = {task.key: [worker.address] for worker in workers for task in only_copies(worker)}
     if others and holders:
         target = min(others, key=lambda worker: worker.nbytes)
         await scheduler.gather_on_worker(target.address, holders)
