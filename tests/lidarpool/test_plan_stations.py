@@ -6,12 +6,19 @@ import re
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from tests.shapes import block, wall
+from tests.shapes import block, level, quad, wall
 
-from lidarpool import LidarError, Scene, SceneMesh, Sensor, box
+from lidarpool import LidarError, Scene, SceneMesh, Sensor, box, load_sensor
 from lidarpool.cli.commands import cli
-from lidarpool.plan.stations import plan_stations
+from lidarpool.plan.stations import (
+    StationVisibility,
+    candidates,
+    plan_stations,
+    sensor_elevations,
+    survey_coverage,
+)
 from lidarscenes.writers.scene_file import write_scene
+from raybeam import RayCaster
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
 
@@ -46,6 +53,143 @@ def areas(plan, scene):
             scene.names, plan.reachable_m2, plan.covered_m2, strict=True
         )
     }
+
+
+@pytest.mark.parametrize("faces_up", [True, False])
+def test_a_side_is_visible_in_range_in_view_and_not_too_slanted(faces_up):
+    """A floor below and beside a station, with a screen that hides a part of it."""
+    floor = level("Floor", 0.3, half=9, middle=(1, -2))
+    if not faces_up:
+        floor = SceneMesh("Floor", floor.vertices, floor.faces[:, ::-1])
+    screen = quad("Screen", (3, 0, 0), (3, 6, 0), (3, 6, 6), (3, 0, 6))
+    scene = Scene.from_meshes([floor, screen])
+    station = np.array([1.0, -1.5, 2.0])
+    random = np.random.default_rng(4)
+    points = random.uniform((-6, -9, 0.3), (9, 6, 0.3), (3000, 3))
+    local = points - scene.origin
+    normals = np.tile([0.0, 0.0, 1.0 if faces_up else -1.0], (3000, 1))
+    offsets = points - station
+    distance = np.linalg.norm(offsets, axis=1)
+    # Rays cross the plane of the screen at its height and width.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (3 - station[0]) / offsets[:, 0]
+        crossing = station + share[:, None] * offsets
+    hidden = (share > 0) & (share < 1) & (crossing[:, 1] > 0) & (crossing[:, 2] > 0)
+    assert hidden.sum() > 100
+    for sensor, slant_deg in (
+        (Sensor.grid(vertical_fov_deg=180, min_range_m=2.5, max_range_m=6.0), 90),
+        (Sensor.grid(vertical_fov_deg=80), 90),
+        (Sensor.grid(vertical_fov_deg=180), 55),
+    ):
+        low, high = sensor_elevations(sensor)
+        sine = offsets[:, 2] / distance
+        expected = ~hidden & (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
+        expected &= (sine >= low) & (sine <= high) & (-sine >= np.cos(np.radians(slant_deg)))
+        sight = StationVisibility(scene, sensor, slant_deg)
+        found = sight.visible_sides(station - scene.origin, local, normals)
+        # A few points are closer to a limit than the tolerance.
+        assert (found == np.where(expected, 1 if faces_up else -1, 0)).mean() > 0.998
+        assert 200 < expected.sum() < 2800
+    below = station * (1, 1, -1)
+    under = StationVisibility(scene, EVERYWHERE, 90).visible_sides(
+        below - scene.origin, local, normals
+    )
+    assert set(under[distance < 2].tolist()) == {-1 if faces_up else 1}
+
+
+def test_elevations_of_a_sensor_are_those_of_its_outermost_rays():
+    low, high = sensor_elevations(Sensor.grid(vertical_fov_deg=60))
+    assert (low, high) == pytest.approx((-0.5, 0.5), abs=0.02)
+    low, high = sensor_elevations(load_sensor("velodyne/hdl32e"))
+    assert np.degrees(np.arcsin([low, high])) == pytest.approx((-30.67, 10.67), abs=0.05)
+
+
+def places(meshes, spacing_m, height_m=1.5):
+    """Return the candidate positions in world coordinates."""
+    scene = Scene.from_meshes(meshes)
+    caster = RayCaster(scene.vertices, scene.faces)
+    return candidates(scene, caster, height_m, spacing_m) + scene.origin
+
+
+def test_candidates_are_on_the_floor_with_space_around_and_above_them():
+    floor = placed("Floor", (8, 4, 0.2), (10, -20, 0.1))  # its top is at 0.3 m
+    curb = placed("Curb", (8, 1, 0.15), (10, -18.5, 0.3))
+    stage = placed("Stage", (1, 3, 1.3), (13.5, -20.5, 0.3))
+    roof = placed("Roof", (2, 3, 0.1), (7, -20.5, 2.0))
+    pole = placed("Pole", (0.4, 0.4, 3), (9.9, -20.6, 0.3))
+    found = places([floor, curb, stage, roof, pole], 1.0)
+    expected = [
+        (x + 0.5, y + 0.5, 1.8 + 0.15 * (y == -19))
+        for x in range(6, 14)
+        for y in range(-22, -18)
+        if y == -19 or not (x == 13 or x < 8)  # neither on the stage nor below the roof
+    ]
+    expected.remove((9.5, -20.5, 1.8))  # 0.2 m from the pole
+    np.testing.assert_allclose(sorted(found.tolist()), sorted(expected), atol=1e-4)
+    assert len(places([floor, curb, stage, roof, pole], 1.0, height_m=1.35)) == len(expected) + 6
+
+
+def test_candidates_climb_slopes_of_up_to_45_degrees():
+    def ramp(rise):
+        meshes = [
+            quad("Low", (0, 0, 0), (6, 0, 0), (6, 4, 0), (0, 4, 0)),
+            quad("Ramp", (6, 0, 0), (8, 0, rise), (8, 4, rise), (6, 4, 0)),
+            quad("High", (8, 0, rise), (12, 0, rise), (12, 4, rise), (8, 4, rise)),
+        ]
+        return places(meshes, 1.0)
+
+    assert len(ramp(1.9)) == len(ramp(-1.9)) == 48
+    steep = ramp(3.0)
+    assert len(steep) == 28 and steep[:, 0].max() < 7  # the lower half of the ramp is 0.75 m high
+    assert ramp(1.9)[:, 2].max() == pytest.approx(3.4, abs=1e-4)
+
+
+def test_a_cloud_covers_what_its_stations_see_near_its_points():
+    """Of two sheets, a station sees one from the front, another sees both sides of the other."""
+    sheets = [wall("Near", 2, (-1, 1), (0, 2)), wall("Far", 6, (-2, 2), (0, 2))]
+    scene = Scene.from_meshes([*sheets, level("Ground", -5, half=1, middle=(40, 40))])
+    positions = np.array([[0.0, 0, 1], [8.0, 0, 1], [4.0, 0, 1]])
+    y, z = np.mgrid[-2:0:0.05, 0:2:0.05].reshape(2, -1)
+    clouds = [
+        np.stack([6 + 0 * y, y, z], axis=1),
+        np.zeros((0, 3)),
+        np.stack([2 + 0 * y, y, z], axis=1),
+    ]
+    options = {"targets": ["Near", "Far"], "slant_deg": 90}
+    one = survey_coverage(scene, EVERYWHERE, positions[:1], clouds, **options)
+    # The near sheet hides 6 x 2 / 2 = 6 m of the width of the far one.
+    assert one.reachable_m2 == pytest.approx([4, 0, 0], abs=0.1)
+    assert one.covered_m2 == pytest.approx([4 / 2 + 0.1, 0, 0], abs=0.06)
+    assert one.area_m2 == pytest.approx([4, 8, 0])
+    every = survey_coverage(scene, EVERYWHERE, positions, clouds, **options)
+    assert every.reachable_m2 == pytest.approx([8, 16, 0], abs=0.2)
+    assert every.covered_m2[1] == pytest.approx(16 / 2 + 0.2, abs=0.15)
+    wide = survey_coverage(scene, EVERYWHERE, positions, clouds, within_m=0.5, **options)
+    assert wide.covered_m2[1] == pytest.approx(16 / 2 + 1.8, abs=0.2)
+    assert every.targets.tolist() == [True, True, False]
+
+
+def test_further_stations_are_chosen_while_they_see_more():
+    """Three rooms in a row, of 6, 4 and 2 m, whose walls hide each other."""
+    walls = [wall(f"Wall {x}", x, (0, 3), (0, 2.5)) for x in (0, 6, 10, 12)]
+    floor = quad("Floor", (0, 0, 0), (12, 0, 0), (12, 3, 0), (0, 3, 0))
+    sides = [quad(f"Side {y}", (0, y, 0), (12, y, 0), (12, y, 2.5), (0, y, 2.5)) for y in (0, 3)]
+    scene = Scene.from_meshes([floor, *walls, *sides])
+    options = {"spacing_m": 1.5, "slant_deg": 90}
+    plan = plan_stations(scene, EVERYWHERE, **options)
+    lengths = np.array([6.0, 4.0, 2.0])
+    rooms_m2 = 3 * lengths + 2 * (3 + lengths) * 2.5
+    np.testing.assert_allclose(plan.coverage, np.cumsum(rooms_m2) / rooms_m2.sum(), atol=0.01)
+    in_order = [(x > 6).astype(int) + (x > 10) for x in plan.stations[:, 0]]
+    assert in_order == [0, 1, 2]
+    assert plan.reachable_m2.sum() == pytest.approx(rooms_m2.sum(), rel=0.01)
+    assert plan.covered_m2 == pytest.approx(plan.reachable_m2)
+    assert plan.area_m2[:2] == pytest.approx([36, 7.5])
+    two = plan_stations(scene, EVERYWHERE, count=2, **options)
+    np.testing.assert_array_equal(two.stations, plan.stations[:2])
+    np.testing.assert_array_equal(two.coverage, plan.coverage[:2])
+    enough = plan_stations(scene, EVERYWHERE, coverage=float(plan.coverage[1]) - 0.01, **options)
+    assert len(enough.stations) == 2
 
 
 @pytest.mark.slow
