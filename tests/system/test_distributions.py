@@ -1,5 +1,6 @@
 """The distributions of this repository: what they hold, alone and together."""
 
+import ast
 import importlib.metadata
 import os
 import re
@@ -8,6 +9,7 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,6 +111,127 @@ def test_other_distributions_are_required_at_the_same_version(name):
     others = {one.name: str(one.specifier) for one in required if one.name in DISTRIBUTIONS}
     assert set(others.values()) <= {f"=={__version__}"}
     assert {*others} == {WHOLE: {*PARTS}, "lidarsim": {"raybeam"}}.get(name, set())
+
+
+# Packages that always come with another.
+WITH_OTHERS = {
+    "markupsafe": "jinja2",
+    "pydantic-core": "pydantic",
+    "tornado": "distributed",
+}
+# {import name of a package that is not required: where it is imported, once it was found}. Look for
+# all paths to a new place: a command that imports a package without a check ends in a traceback
+# where only the requirements are installed.
+OPTIONAL = {
+    "DracoPy": ("lidarsim/scene/files/gltf_draco.py",),
+    "IPython": ("lidarsim/environment/notebook.py",),
+    "betterosi": ("lidarpool/clouds/osi.py", "lidarpool/scenario/osi_trace.py"),
+    "cuda": ("raybeam/cuda_backend.py",),
+    "cupy": ("raybeam/cuda_backend.py",),
+    "cyclonedds": ("lidarpool/playback/dds.py", "lidarpool/playback/serialized_topics.py"),
+    "foxglove": ("lidarpool/viewers/foxglove_server.py",),
+    "fsspec": ("lidarsim/io/storage.py",),
+    "google": ("lidarpool/serving/",),
+    "grpc": ("lidarpool/serving/",),
+    "ifcopenshell": ("lidarscenes/files/ifc_child.py",),
+    "kr8s": ("poolpart/deploy/kubernetes.py",),
+    "laspy": ("lidarpool/clouds/las",),
+    "lazrs": ("lidarpool/clouds/las",),
+    "llvmlite": ("raybeam/",),  # comes with numba
+    "lpips": ("lidarpool/comparing/lidar4d.py",),
+    "lz4": ("lidarpool/augmentation/rewriting/mcap_copy.py",),  # comes with rosbags
+    "mujoco": ("lidarscenes/mujoco/model_child.py",),
+    "numba": ("raybeam/",),
+    "ouster": ("lidarsim/packets/ouster.py",),
+    "pandas": ("poolpart/task_table.py",),
+    "prometheus_client": ("poolpart/extras/metrics.py",),
+    "pxr": ("lidarscenes/files/usd_child.py", "lidarscenes/sensors/omnilidar_child.py"),
+    "py4dgeo": ("lidarpool/comparing/surveys/m3c2.py",),
+    "pyarrow": (
+        "lidarpool/clouds/parquet", "lidarpool/datasets/job_table.py",
+        "lidarsim/sensor_files/ray_parquet.py",
+    ),
+    "pye57": ("lidarpool/clouds/e57",),
+    "rasterio": (
+        "lidarpool/clouds/navigation_files.py", "lidarpool/clouds/well_known_text.py",
+        "lidarpool/plan/flight_area.py", "lidarscenes/files/rasters.py",
+        "lidarsim/scene/files/coordinate_systems.py", "lidarsim/scene/files/stated_system.py",
+    ),
+    "rerun": ("lidarpool/clouds/rrd.py", "lidarpool/viewers/rerun_server.py"),
+    "rosbags": (
+        "lidarpool/augmentation/rewriting/bag_rewriter.py", "lidarpool/clouds/ros/",
+        "lidarpool/following/pose_input.py", "lidarpool/playback/dds.py",
+        "lidarsim/columns/bags.py", "lidarsim/columns/closing_bag.py",
+    ),
+    "shapely": ("lidarpool/plan/flight_",),
+    "small_gicp": ("lidarpool/reconstruction/odometry.py",),
+    "torch": ("lidarpool/comparing/lidar4d.py", "lidarpool/datasets/torch_sweeps.py"),
+    "velodyne_decoder": ("lidarsim/packets/velodyne.py",),
+}  # fmt: skip
+
+
+def plain(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+IMPORT = re.compile(r"""^ *(?:from|import) (\w+)|import_module\("(\w+)""", re.MULTILINE)
+
+
+def imports_in(code: str, known: set[str]) -> set[str]:
+    """Names of other packages that a module imports anywhere, except for annotations."""
+    known = known | sys.stdlib_module_names
+    if {name for names in IMPORT.findall(code) for name in names if name} <= known:
+        return set()  # parsing takes long
+    tree = ast.parse(code)
+    unseen: set[int] = set()
+    names: set[str] = set()
+    for node in ast.walk(tree):  # outer nodes come first
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            unseen |= {id(inner) for part in node.body for inner in ast.walk(part)}
+        if id(node) in unseen:
+            continue
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names.add(node.module or "")
+        elif isinstance(node, ast.Call) and "import_module" in (
+            getattr(node.func, "id", ""),
+            getattr(node.func, "attr", ""),
+        ):
+            names |= {one.value for one in node.args[:1] if isinstance(one, ast.Constant)}
+    return {name.partition(".")[0] for name in names} - known
+
+
+def test_imports_are_required_or_checked():
+    """Every imported package is required by its distribution, or its absence is reported."""
+    unknown = []
+    places = {name: {*prefixes} for name, prefixes in OPTIONAL.items()}
+    providers = importlib.metadata.packages_distributions()
+    for name, distribution in DISTRIBUTIONS.items():
+        known = {*distribution.imports} | required_imports(name, providers)
+        for package in distribution.packages:
+            folder = (ROOT / distribution.folder / package).resolve()
+            for file in folder.rglob("*.py"):
+                module = file.relative_to(folder.parent).as_posix()
+                for imported in imports_in(file.read_text(encoding="utf-8"), known):
+                    prefixes = [one for one in OPTIONAL.get(imported, ()) if module.startswith(one)]
+                    places.get(imported, set()).difference_update(prefixes)
+                    if not prefixes:
+                        unknown.append(f"{module} imports {imported}")
+    assert unknown == []
+    assert {name for name, unused in places.items() if unused} == set()
+
+
+def required_imports(name: str, providers: Mapping[str, list[str]]) -> set[str]:
+    """Import names of the packages that a distribution requires, without extras."""
+    required = {Requirement(text).name for text in declared(name)["project"]["dependencies"]}
+    found = {one for other in required & {*DISTRIBUTIONS} for one in DISTRIBUTIONS[other].imports}
+    wanted = {plain(one) for one in required}
+    for imported, names in providers.items():
+        for provider in map(plain, names):
+            if wanted & {provider, WITH_OTHERS.get(provider)}:
+                found.add(imported)
+    return found
 
 
 def outside() -> dict[str, str]:
@@ -236,6 +359,14 @@ class Environment:
         return self.run("python", "-I", "example.py", cwd=folder)
 
 
+RINGS = """
+scene: seed
+sensor: velodyne/vlp16
+poses: [[0, 0, 1], [1, 0, 1]]
+output: {write: [kitti]}
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.extended(keep=("poolpart",))
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
@@ -247,6 +378,14 @@ def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
     if name == WHOLE:
         assert "results in out: cloud.ply" in surveys(alone, tmp_path)
         assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+        (tmp_path / "kitti.yaml").write_text(RINGS)
+        alone.run("lidarpool", "run", "kitti.yaml", "--out", "kitti", cwd=tmp_path)
+        recording = str(tmp_path / "kitti" / "kitti")
+        for command in (
+            ("augment", recording, "--out", "wet", "--model", "velodyne/vlp16", "--rain", "9"),
+            ("compare", recording, recording, "--out", "same"),
+        ):
+            assert not alone.run("lidarpool", *command, cwd=tmp_path).startswith("exit")
     else:
         assert alone.run_readme(name, tmp_path) == distribution.prints
 

@@ -256,11 +256,11 @@ def _read_site(
 ) -> _Site:
     """Read the area and the terrain, and convert the area to the coordinates of the terrain."""
     import numpy as np
-    import shapely
 
-    from ..plan.flight_area import GEOGRAPHIC, read_area, utm_epsg
+    from ..plan.flight_area import GEOGRAPHIC, import_shapely, read_area, utm_epsg
     from ..plan.flight_lines import Terrain
 
+    shapely = import_shapely()
     drawn = read_area(area)
     if drawn is None and terrain is not None:
         raise click.UsageError(

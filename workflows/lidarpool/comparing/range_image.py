@@ -9,13 +9,11 @@ rings are matched by the elevation of their points.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 from lidarsim.words import plural
@@ -95,11 +93,6 @@ class _PolarSweep:
         latter case, the rings are not cones around the origin, or the points are too far away.
         """
         has_column = "channel" in sweep.columns
-        if not has_column and find_spec("scipy") is None:
-            raise LidarError(
-                f"{name} has no ring column, and finding its rings requires scipy. Run "
-                f"`{install_command('lidarpool[fit]')}`"
-            )
         rings = sweep.rings
         if rings is None:
             raise LidarError(f"{name} has no ring column, such as `ring` or `channel`")

@@ -58,7 +58,7 @@ def read_area(text: str) -> Area | None:
     bounds = re.fullmatch(r"\s*(?:[-+.\deE]+\s*,\s*){3}[-+.\deE]+\s*", text)
     if not (is_wkt or bounds or suffix in (*_GEOJSON, *_WKT)):
         return None
-    shapely = _shapely()
+    shapely = import_shapely()
     epsg = None
     with convert_errors(f"The area {_shorten(text)} cannot be read"):
         if bounds:
@@ -82,7 +82,7 @@ def read_area(text: str) -> Area | None:
 
 def _shape_from_wkt(text: str) -> Any:
     """Return the shape of a WKT string. Raise ValueError if it is invalid."""
-    shapely = _shapely()
+    shapely = import_shapely()
     try:
         return shapely.from_wkt(text)
     except shapely.errors.GEOSException as error:
@@ -190,7 +190,7 @@ def transform_shape(shape: Any, source: int, target: int) -> Any:
             f"A conversion from EPSG:{source} to EPSG:{target} requires rasterio. Run "
             f"{install_command('lidarpool[geo]')}."
         )
-    shapely = _shapely()
+    shapely = import_shapely()
     with convert_errors(f"A conversion from EPSG:{source} to EPSG:{target} is not possible"):
         transformed = import_module("rasterio.warp").transform_geom(
             f"EPSG:{source}", f"EPSG:{target}", shapely.geometry.mapping(shape)
@@ -198,7 +198,7 @@ def transform_shape(shape: Any, source: int, target: int) -> Any:
     return shapely.geometry.shape(transformed)
 
 
-def _shapely() -> Any:
+def import_shapely() -> Any:
     """Import shapely. Raise LidarError if it is not installed."""
     if find_spec("shapely") is None:
         raise LidarError(

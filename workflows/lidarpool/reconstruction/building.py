@@ -15,7 +15,6 @@ import numpy as np
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
-from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
@@ -178,7 +177,6 @@ def twin(
         is using it; or if the cluster is lost.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
-    require_package("scipy", "twin", "Reconstructing a recording")
     if lidar4d_window is not None:
         check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
     base = None if model is None else read_model(model)  # before the recording, which takes long

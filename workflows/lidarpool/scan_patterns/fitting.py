@@ -13,7 +13,6 @@ import yaml
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
-from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import Floats
@@ -131,8 +130,8 @@ def fit_pattern(
     Raises
     ------
     LidarError
-        If the recording cannot be read or has too few returns, if the sensor moves, if the returns
-        do not come from a spinning sensor and `as_rays` is false, or if scipy is missing.
+        If the recording cannot be read or has too few returns, if the sensor moves, or if the
+        returns do not come from a spinning sensor and `as_rays` is false.
 
     Examples
     --------
@@ -145,7 +144,6 @@ def fit_pattern(
     >>> np.round(fitted.model.beams.elevation_deg[:3])
     array([-15., -13., -11.])
     """
-    require_package("scipy", "fit", "Fitting sensor models")
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, name="the recording")
     returns = PatternReturns.read(recording)

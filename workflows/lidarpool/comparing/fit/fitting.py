@@ -15,7 +15,6 @@ import yaml
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
-from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.motion.trajectory import Pose
@@ -121,12 +120,11 @@ def fit(
     Raises
     ------
     LidarError
-        If the recording cannot be read, has no sweeps or rings, or contains several sensors; if the
-        sensor moves, but the scene or the poses are unknown; or if scipy is missing.
+        If the recording cannot be read, has no sweeps or rings, or contains several sensors, or if
+        the sensor moves, but the scene or the poses are unknown.
     """
     if white is not None:
         check_number("white", white, gt=0)
-    require_package("scipy", "fit", "Fitting sensor models")
     named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
