@@ -124,7 +124,10 @@ def test_surfaces_intersect_the_same_voxels_as_clipped_triangles():
     corners = random.uniform(-1, 7, (40, 3, 3))
     for triangle in corners:
         found = np.full((6, 5, 4), -1, np.int32)
-        loops.add_surfaces(triangle[None], np.zeros(1, np.int32), found, np.full(found.shape, 9e9))
+        none = np.full(found.shape, -1, np.int32)
+        numbers = np.zeros(1, np.int32)
+        square = np.full(found.shape, 9e9)
+        loops.add_surfaces(triangle[None], numbers, numbers - 1, none, found, square)
         weights = random.dirichlet((1, 1, 1), 4000)
         cells = np.floor(weights @ triangle).astype(int)
         cells = cells[((cells >= 0) & (cells < found.shape)).all(axis=1)]
@@ -228,6 +231,45 @@ def test_the_closest_surface_and_the_visible_objects_count():
     lowest = found.instances[:, :, 0]
     assert set(np.unique(lowest)) == {0, 2} and (found.instances[:, :, 1:] == FREE).all()
     assert found.observed[overlap(GRID, (1.1, -0.2, -0.95), (1.2, 0.2, -0.85))].all()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("yaw_deg", [0, 90])
+@pytest.mark.parametrize(
+    ("ground_m", "car_m"), [(-1.5, -1.5), (-1.5, -1.53), (-1.4, -1.4), (-1.5, -1.3)]
+)
+def test_voxels_in_a_solid_are_its_own_where_it_stands(ground_m, car_m, yaw_deg, order):
+    """The ground is on a boundary of voxels (-1.5), or in the lower half of a voxel."""
+    ground = level("Ground", ground_m)
+    car = block("Car", (2.2, 1.8, 1.4), (1.9, 0.3, car_m + 0.7))
+    scene = Scene.from_meshes([ground, car][::order])
+    survey = Survey(FEW_RAYS, poses=[Pose((0, 0, 0), yaw_deg=yaw_deg)], steps=1)
+    found = occupancy_of(scene, survey, GRID)
+    x, y, z = np.moveaxis(centers_of(GRID), -1, 0)
+    if yaw_deg:
+        x, y = -y, x
+    inside = (np.abs(x - 1.9) < 1.1) & (np.abs(y - 0.3) < 0.9)
+    inside &= (z > car_m) & (z < car_m + 1.4)
+    car_number = scene.object_names.index("Car")
+    assert inside.any()
+    assert (found.instances[inside] == car_number).all()
+    beside = (np.abs(x - 1.9) > 1.4) | (np.abs(y - 0.3) > 1.2)
+    touched = np.abs(z - ground_m) < GRID.voxel_m / 2 + 1e-6
+    ground_number = scene.object_names.index("Ground")
+    np.testing.assert_array_equal(
+        found.instances[beside], np.where(touched, ground_number, FREE)[beside]
+    )
+
+
+def test_surfaces_in_a_solid_keep_their_voxels():
+    """A driver in a closed car, whose surfaces pass through voxels with centers in the car."""
+    car = block("Car", (4.2, 2.2, 1.4), (6.1, 0.3, -0.8))
+    driver = block("Driver", (0.9, 0.4, 0.9), (6.0, 0.2, -0.8))
+    found = occupancy_of(Scene.from_meshes([car, driver]), Survey(FEW_RAYS, poses=[(0, 0, 0)]))
+    crossed = overlap(GRID, (5.55, 0.0, -1.25), (6.45, 0.4, -0.35))
+    crossed &= np.abs(centers_of(GRID) - (6.0, 0.2, -0.8)).max(axis=-1) < 0.6
+    assert (found.instances == 1).sum() >= 4
+    assert (found.instances[~crossed] != 1).all()
 
 
 def test_a_walking_person_is_deformed_as_at_the_start_of_a_sweep():

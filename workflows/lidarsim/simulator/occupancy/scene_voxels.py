@@ -50,6 +50,12 @@ class ClosedParts(NamedTuple):
         first_rows = np.flatnonzero(np.diff(component[kept], prepend=-1))
         return cls(proper[kept], np.append(first_rows, len(kept)))
 
+    def of_faces(self, count: int) -> Ints32:
+        """Return the first face of the component of each of `count` faces, or -1 for none."""
+        component = np.full(count, -1, np.int32)
+        component[self.faces] = np.repeat(self.faces[self.starts[:-1]], np.diff(self.starts))
+        return component
+
 
 def _merged_corners(vertices: Floats, faces: Integers, owners: Integers) -> tuple[Ints, int]:
     """Return the corners (f, 3) of faces as indices of distinct vertices, and the vertex count."""
@@ -100,23 +106,29 @@ class SceneVoxels:
     def triangles(self, grid: VoxelGrid, pose: GridPose, time_ns: float) -> Ints32:
         """Return the triangle of each voxel at a time in nanoseconds, or -1 for none.
 
-        The shape is that of the grid. Surfaces take precedence over solids.
+        The shape is that of the grid. Surfaces take precedence over solids, unless they only touch
+        a voxel whose center is inside a solid, such as the ground below a car.
         """
         from . import voxel_loops as loops  # imported here because numba is slow to import
 
         triangle = np.full(grid.shape, -1, np.int32)
         square = np.full(grid.shape, np.inf)
         bodies = [self._placed(body, grid, pose) for body in self._bodies(grid, pose, time_ns)]
-        for body in bodies:
-            for faces in _blocks_in_grid(body, grid):
-                numbers = (body.first + faces).astype(np.int32)
-                corners = body.vertices[body.faces[faces]]
-                loops.add_surfaces(to_writable(corners), numbers, triangle, square)
+        solid = np.full(grid.shape, -1, np.int32)
         for body in bodies:
             for faces in _solids_in_grid(body, grid):
                 corners = to_writable(body.vertices[body.faces[faces]])
-                loops.add_interior(corners, body.first + int(faces[0]), triangle)
-        return triangle
+                loops.add_interior(corners, body.first + int(faces[0]), solid)
+        for body in bodies:
+            component = body.closed.of_faces(len(body.faces))
+            for faces in _blocks_in_grid(body, grid):
+                numbers = (body.first + faces).astype(np.int32)
+                parts = np.where(component[faces] < 0, -1, body.first + component[faces])
+                corners = to_writable(body.vertices[body.faces[faces]])
+                loops.add_surfaces(
+                    corners, numbers, parts.astype(np.int32), solid, triangle, square
+                )
+        return np.where(triangle < 0, solid, triangle)
 
     @staticmethod
     def _placed(body: Body, grid: VoxelGrid, pose: GridPose) -> Body:

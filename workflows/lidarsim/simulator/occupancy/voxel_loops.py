@@ -18,6 +18,7 @@ from .marks import HIT, TRAVERSED
 # A surface within this distance of a voxel intersects it, regardless of rounding errors.
 SLACK = 1e-6
 _HALF = 0.5 + SLACK
+_NEAR_SQUARE = (0.5 - SLACK) ** 2  # squared distance of the center from the sides of its voxel
 
 
 @inlined
@@ -104,6 +105,21 @@ def _square(a, b, c, n):
 
 
 @inlined
+def _ranked(square, part, inside):
+    """Return the squared distance of a surface from the center of a voxel, for comparison.
+
+    `part` is the closed surface to which the surface belongs, and `inside` the one that contains
+    the center, or -1. It wins ties. The result for other surfaces that only touch the voxel is
+    infinite.
+    """
+    if inside < 0:
+        return square
+    if part == inside:
+        return square - SLACK
+    return square if square < _NEAR_SQUARE else np.inf
+
+
+@inlined
 def _first(low, limit):
     """Return the first voxel along an axis that a surface with the lower bound `low` touches."""
     return max(math.ceil(max(low - 1 - SLACK, -1.0)), 0) if low < limit + 1 else limit
@@ -116,12 +132,17 @@ def _last(high, limit):
 
 
 @compiled()
-def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compiled loop
+def add_surfaces(corners, numbers, parts, solid, triangle, square):  # noqa: PLR0914 - a loop
     """Set the triangle of each voxel that a triangle intersects.
 
-    `corners` (f, 3, 3) and `numbers` (f,) are triangles and their numbers. If several triangles
-    intersect a voxel, `triangle` (x, y, z) receives the one that is closest to its center, and
-    `square` (x, y, z) the squared distance. Ties are resolved in favor of earlier triangles.
+    `corners` (f, 3, 3) and `numbers` (f,) are triangles and their numbers, and `parts` (f,) are the
+    closed surfaces to which they belong, or -1. If several triangles intersect a voxel, `triangle`
+    (x, y, z) receives the one that is closest to its center, and `square` (x, y, z) the squared
+    distance. Ties are resolved in favor of earlier triangles.
+
+    `solid` (x, y, z) is the closed surface that contains the center of each voxel, or -1. In these
+    voxels, triangles of other surfaces are ignored if they are not closer to the center than the
+    sides of the voxel, or than the closed surface itself.
     """
     shape = triangle.shape
     for row in range(len(corners)):
@@ -164,7 +185,8 @@ def add_surfaces(corners, numbers, triangle, square):  # noqa: PLR0914 - a compi
                     c = (t[2, 0] - x, t[2, 1] - y, t[2, 2] - z)
                     if not _intersects(a, b, c, n):
                         continue
-                    distance = _square(a, b, c, n)
+                    inside = solid[voxel[0], voxel[1], voxel[2]]
+                    distance = _ranked(_square(a, b, c, n), parts[row], inside)
                     if distance < square[voxel[0], voxel[1], voxel[2]]:
                         square[voxel[0], voxel[1], voxel[2]] = distance
                         triangle[voxel[0], voxel[1], voxel[2]] = numbers[row]
@@ -193,17 +215,17 @@ def _turns(t, x, y):
 
 
 @compiled()
-def add_interior(corners, number, triangle):  # noqa: C901 - a compiled loop
-    """Set the triangle of each voxel whose center is inside a closed surface.
+def add_interior(corners, number, solid):  # noqa: C901 - a compiled loop
+    """Set `solid` (x, y, z) to a number in each voxel whose center is inside a closed surface.
 
-    `corners` (f, 3, 3) are the triangles of the surface, with consistent orientation. Voxels that
-    already have a triangle do not change. The others receive `number`.
+    `corners` (f, 3, 3) are the triangles of the surface, with consistent orientation. Voxels inside
+    an earlier surface do not change.
     """
     first = np.empty(3, np.int64)
     stop = np.empty(3, np.int64)
     for axis in range(3):
-        first[axis] = _first(corners[:, :, axis].min(), triangle.shape[axis])
-        stop[axis] = _last(corners[:, :, axis].max(), triangle.shape[axis]) + 1
+        first[axis] = _first(corners[:, :, axis].min(), solid.shape[axis])
+        stop[axis] = _last(corners[:, :, axis].max(), solid.shape[axis]) + 1
         if first[axis] >= stop[axis]:
             return
     # Sum of the turns of all triangles below each center, as differences along z.
@@ -213,10 +235,10 @@ def add_interior(corners, number, triangle):  # noqa: C901 - a compiled loop
         e = (t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2])
         f = (t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2])
         n = (e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0])
-        begin_x = max(_first(min(t[0, 0], t[1, 0], t[2, 0]), triangle.shape[0]), first[0])
-        end_x = min(_last(max(t[0, 0], t[1, 0], t[2, 0]), triangle.shape[0]) + 1, stop[0])
-        begin_y = max(_first(min(t[0, 1], t[1, 1], t[2, 1]), triangle.shape[1]), first[1])
-        end_y = min(_last(max(t[0, 1], t[1, 1], t[2, 1]), triangle.shape[1]) + 1, stop[1])
+        begin_x = max(_first(min(t[0, 0], t[1, 0], t[2, 0]), solid.shape[0]), first[0])
+        end_x = min(_last(max(t[0, 0], t[1, 0], t[2, 0]), solid.shape[0]) + 1, stop[0])
+        begin_y = max(_first(min(t[0, 1], t[1, 1], t[2, 1]), solid.shape[1]), first[1])
+        end_y = min(_last(max(t[0, 1], t[1, 1], t[2, 1]), solid.shape[1]) + 1, stop[1])
         for i in range(begin_x, end_x):
             for j in range(begin_y, end_y):
                 turn = _turns(t, i + 0.5, j + 0.5)
@@ -233,8 +255,8 @@ def add_interior(corners, number, triangle):  # noqa: C901 - a compiled loop
             total = 0
             for k in range(first[2], stop[2]):
                 total += turns[i - first[0], j - first[1], k - first[2]]
-                if total != 0 and triangle[i, j, k] < 0:
-                    triangle[i, j, k] = number
+                if total != 0 and solid[i, j, k] < 0:
+                    solid[i, j, k] = number
 
 
 @compiled()
