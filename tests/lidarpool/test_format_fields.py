@@ -10,6 +10,7 @@ import tarfile
 from dataclasses import dataclass, replace
 from functools import cache
 from io import BytesIO
+from pathlib import Path
 from typing import ClassVar
 
 import laspy
@@ -26,6 +27,7 @@ from lidarpool import (
     Beams,
     Fault,
     LidarError,
+    Material,
     Mounted,
     Pose,
     Returns,
@@ -36,7 +38,11 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.clouds.writing import ExportSpec
+from lidarpool.clouds.format_table import FORMATS, load_format
+from lidarpool.clouds.ros.layouts import LAYOUTS
+from lidarpool.clouds.writing import ExportSpec, with_format_columns
+from lidarpool.scenario.prepare import prepare
+from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.io.yamlfile import load_yaml
@@ -391,7 +397,7 @@ def test_compensated_formats_are_so_whatever_the_clouds_frame(tmp_path, name, co
             placed = np.fromfile(path, "<f4").reshape(-1, 5)[:, :3]
         else:
             with pye57.E57(str(tmp_path / "out")) as file:
-                raw = file.read_scan_raw(sweep)
+                raw = file.read_scan_raw(sweep, ignore_unsupported_fields=True)
                 name = f"sweep {sweep + 1}, motion compensated"
                 assert file.get_header(sweep)["name"].value() == name
             placed = np.stack([raw[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
@@ -638,6 +644,12 @@ def test_flight_lines_and_sensors_are_sources(tmp_path):
     _, cloud = flown("sine", [Mounted(AIRBORNE["polygon"], name="front"), back])
     las = read_las(cloud, tmp_path / "b.laz")
     assert set(las.point_source_id) == {1, 2, 3, 4}
+    np.testing.assert_array_equal(las.scanner_channel, cloud.sensor)
+    # A scanner with an entry for each flight line is one scanner.
+    entries = [Mounted(AIRBORNE["sine"], Pose((0.5, 0, 0)), name) for name in ("1", "2")]
+    _, cloud = flown("sine", entries)
+    las = read_las(cloud, tmp_path / "c.laz")
+    assert set(cloud.sensor) == {0, 1} and set(las.scanner_channel) == {0}
     of_back = las[las.sensor == 1]
     assert set(of_back.point_source_id) == {2, 4}
     # Its x axis points backwards, and still the left is negative and directions are as they say.
@@ -699,3 +711,149 @@ def test_parquet_and_ply_are_in_the_world_and_their_columns_fit(tmp_path):
     )
     white = (10 / np.maximum(columns["range"], 1e-9)) ** 2
     np.testing.assert_allclose(columns["reflectance"] * white, columns["intensity"], rtol=2e-3)
+
+
+def field_rows():
+    """Rows of the table of fields: format, field, source, and what a file has without it."""
+    described = {}
+    for name in FORMATS:
+        described.setdefault(load_format(name).fields, []).append(f"`{name}`")
+    for name, layout in LAYOUTS.items():
+        described.setdefault(layout.point_fields, []).append(f"layout `{name}`")
+    for fields, names in described.items():
+        for field in fields:
+            source = ", ".join(f"`{name}`" for name in field.columns) or field.source
+            source += ", if classes have names" * field.if_named + ", on request" * field.on_request
+            missing = field.missing or ("refused" if field.columns else "always known")
+            yield [", ".join(names), field.name, source, missing]
+
+
+def test_the_table_of_fields_is_that_of_the_formats():
+    page = (Path(__file__).parents[2] / "docs/how-to/formats.md").read_text("utf-8")
+    section = page.partition("## Fields and columns\n")[2].partition("\n## ")[0]
+    table = [line.strip("| ").split(" | ") for line in section.splitlines() if line[:1] == "|"]
+    rows = [*field_rows()]
+    assert table[2:] == rows, "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("ply", ""),
+        ("parquet", ""),
+        ("las", "intensity return_number returns time [class]"),
+        ("laz", "intensity return_number returns time [class]"),
+        ("e57", "intensity return_number returns time ray"),
+        ("pcd", "intensity time"),
+        ("kitti", "reflectivity class"),
+        ("nuscenes", "intensity"),
+        ("webdataset", "intensity class"),
+        ("images", "ray range"),
+        ("osi", "intensity reflectance"),
+        ("mcap", "intensity time"),
+        ("rrd", "intensity"),
+        ("pcap", "ray range reflectivity"),
+    ],
+)
+def test_a_run_computes_the_columns_of_its_formats(name, expected):
+    data = {"scene": "seed", "poses": [[0, 0, 1]], "output": {"write": [name]}}
+    data["sensor"] = {"model": "velodyne/vlp16"}
+
+    def computed(**fields):
+        survey = prepare(Scenario.from_data(data | fields)).survey
+        return {column.name for column in survey.stored_columns[5:]}
+
+    always = {word for word in expected.split() if word[0] != "["}
+    assert computed() == always
+    classed = [{"objects": "*", "class": 4}]
+    assert computed(materials=classed) == {word.strip("[]") for word in expected.split()}
+    named = computed(materials=classed, classes={4: "thing"})  # names bring the column
+    assert named == always | {"class"}
+    assert computed(cloud={"columns": ["range"]}) == always | {"range"}
+
+
+def posts(mode, columns=(), formats=("las", "e57")):
+    """A cloud of posts before a wall, with the columns that formats bring, as a run has them."""
+    beam = {"subrays": 7, "divergence_mrad": 10.0}
+    survey = Survey(
+        load_sensor("velodyne/vlp16"), poses=[(2, 1, 0)], steps=72, columns=columns,
+        returns=Returns(mode, **beam), materials=[Material("*", semantic_class=7)],
+    )  # fmt: skip
+    survey = with_format_columns(survey, [ExportSpec(name) for name in formats])
+    return survey, cloud_of(survey)
+
+
+def test_las_and_e57_have_times_returns_and_intensities_without_being_asked(tmp_path):
+    survey, cloud = posts("dual")
+    sweeps = cloud.sweeps()
+    assert set(cloud.returns) == {1, 2}
+    las = read_las(cloud, tmp_path / "a.las")
+    np.testing.assert_array_equal(las.return_number, cloud.return_number)
+    np.testing.assert_array_equal(las.number_of_returns, cloud.returns)
+    np.testing.assert_allclose(las.gps_time, cloud.time / 1e9, atol=1e-9)
+    np.testing.assert_array_equal(las.classification, 7)
+    assert np.corrcoef(las.intensity, np.minimum(cloud.intensity, las.energy.max()))[0, 1] > 0.9
+    assert set(las.scanner_channel) == {0}
+    save_cloud(cloud, tmp_path / "a.e57")
+    names = ("returnIndex", "returnCount", "timeStamp", "rowIndex", "columnIndex")
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        for sweep, points in enumerate(sweeps.points(cloud)):
+            header = file.get_header(sweep)
+            found = {}
+            buffers = pye57.libe57.VectorSourceDestBuffer()
+            for name in names:
+                found[name] = np.zeros(len(points))
+                buffer = (file.image_file, name, found[name], len(points), True, True)
+                buffers.append(pye57.libe57.SourceDestBuffer(*buffer))
+            header.points.reader(buffers).read()
+            np.testing.assert_array_equal(found["returnIndex"] + 1, points.return_number)
+            np.testing.assert_array_equal(found["returnCount"], points.returns)
+            begin_s = header["acquisitionStart"]["dateTimeValue"].value()
+            np.testing.assert_allclose(begin_s + found["timeStamp"], points.time / 1e9, atol=1e-9)
+            np.testing.assert_array_equal(found["rowIndex"], points.channel)
+            firing = (points.time - sweeps.begins_ns[sweep]) // 55_296  # of the data sheet
+            np.testing.assert_array_equal(found["columnIndex"], firing)
+            limits = header["indexBounds"]
+            assert limits["returnMaximum"].value() == 1 and limits["rowMaximum"].value() == 15
+            assert limits["columnMaximum"].value() == firing.max() > 800
+    for name in ("las", "e57"):
+        assert not ExportSpec(name).describe_empty_fields(cloud, sweeps, survey)
+
+
+def test_what_las_and_e57_do_not_know_is_zero_or_left_out_and_noted(tmp_path):
+    survey, cloud = posts("dual", formats=())
+    las = read_las(cloud, tmp_path / "a.las")
+    for name in ("return_number", "number_of_returns", "gps_time", "intensity", "classification"):
+        assert not np.asarray(las[name]).any(), name
+    save_cloud(cloud, tmp_path / "a.e57")
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        header = file.get_header(0)
+        assert header.point_fields == ["cartesianX", "cartesianY", "cartesianZ"]
+        assert not header.node.isDefined("indexBounds")
+    notes = ExportSpec("las").notes(cloud, cloud.sweeps())
+    unknown = "intensity, return number, number of returns, classification and GPS time"
+    columns = "intensity, return_number, returns, class or time"
+    again = "Run the survey again with `output: {write: [las]}`"
+    assert notes == [
+        f"LAS stores 0 as {unknown}, because the cloud has no columns {columns}. {again}"
+    ]
+    classless = replace(survey, materials=[])
+    (note,) = ExportSpec("las").notes(cloud, cloud.sweeps(), (), classless)
+    assert "GPS time" in note and "class" not in note
+    lost, note = ExportSpec("e57").notes(cloud, cloud.sweeps(), ())
+    assert lost == "E57 cannot store object"
+    assert note.startswith(
+        "E57 omits intensity, returnIndex, returnCount, timeStamp, rowIndex and columnIndex, "
+        "because the cloud has no columns intensity, return_number, returns, time or ray. "
+    )
+
+
+@pytest.mark.parametrize("mode", ["strongest", "first", "last"])
+def test_the_return_mode_tells_single_returns(tmp_path, mode):
+    _, cloud = posts(mode, columns=["returns"], formats=())
+    assert set(cloud.returns) == {1}
+    bare = replace(cloud, columns={k: v for k, v in cloud.columns.items() if k != "returns"})
+    las = read_las(bare, tmp_path / "a.las")
+    assert set(las.return_number) == set(las.number_of_returns) == {1}
+    notes = ExportSpec("las").notes(bare, bare.sweeps())
+    assert notes and not any("return" in note.partition(" Run ")[0] for note in notes)

@@ -45,7 +45,7 @@ FORMATS = {
     "nuscenes": ("nuscenes", "numpy", {"times", "object"}),
     "webdataset": ("webdataset", "numpy", set()),
     "images": ("images", "numpy", {"stamps"}),
-    "e57": ("cloud.e57", "pye57", {"channel", "times", "stamps", "class", "object"}),
+    "e57": ("cloud.e57", "pye57", {"channel", "stamps", "class", "object"}),
     "pcap": ("pcap/lidar.pcap", "numpy", {"poses", "class", "object", "bounds"}),
 }
 AS_FIRED = ("mcap", "rosbag2", "pcd", "pcap")  # others are compensated for the motion

@@ -10,6 +10,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from .clouds.cloud_format import CloudFormat
 from .clouds.format_row import FormatRow
 from .clouds.multi_file_format import MultiFileFormat
+from .clouds.point_field import PointField
 from .clouds.recording import Recording, RecordingSource
 from .clouds.writing import ExportSpec
 
@@ -20,6 +21,7 @@ __all__ = [
     "ExportSpec",
     "FormatRow",
     "MultiFileFormat",
+    "PointField",
     "Recording",
     "RecordingSource",
     "Sweep",

@@ -71,13 +71,20 @@ def test_bag_to_other_formats(written, tmp_path):
 
 def test_clouds_are_in_world_coordinates(written, tmp_path):
     made = converter(written("kitti"), "las", "01")
-    rewrite(made, tmp_path / "new.las", tmp_path / "work", changed)
+    notes = rewrite(made, tmp_path / "new.las", tmp_path / "work", changed)
     sweeps = [changed(made.recording, number).sweep for number in range(3)]
     expected = np.concatenate([sweep.in_world() for sweep in sweeps])
     file = laspy.read(tmp_path / "new.las")
     np.testing.assert_allclose(file.xyz, expected, atol=0.0006)
     classes = np.concatenate([sweep.columns["class"] for sweep in sweeps])
     np.testing.assert_array_equal(file.classification, np.minimum(classes, 255))
+    # KITTI has neither times of points nor return numbers.
+    for name in ("return_number", "number_of_returns", "gps_time"):
+        assert not np.asarray(file[name]).any(), name
+    assert notes == [
+        "LAS stores 0 as return number, number of returns and GPS time, because the cloud has no "
+        "columns return_number, returns or time."
+    ]
     made = converter(written("kitti"), "ply", "01")
     rewrite(made, tmp_path / "new.ply", tmp_path / "work2", changed)
     cloud = read_cloud(tmp_path / "new.ply")
@@ -106,6 +113,8 @@ def test_bare_points_to_bags(tmp_path, layout):
     for number in range(2):
         expected = changed(made.recording, number).sweep.points
         np.testing.assert_allclose(recording[number].points, expected, atol=1e-4)
+        if layout == "autoware":  # UNKNOWN, because the return mode is
+            assert not recording[number].columns["return_type"].any()
 
 
 def test_inserted_objects_are_actors(written, tmp_path):

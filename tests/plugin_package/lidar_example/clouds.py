@@ -15,7 +15,7 @@ class SweepFolder(MultiFileFormat):
         folders=("[0-9]*.npy",),  # files in folders that the format opens
     )
     by_sweep = True
-    stored = ()
+    other_columns = False
     file_pattern = r"\d+\.npy"
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:

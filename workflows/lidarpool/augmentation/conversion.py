@@ -41,8 +41,8 @@ _PERIOD_NS = 1e8  # time between sweeps without timestamps
 _MIN_EPOCH_NS = 1e17  # larger timestamps are times since 1970
 # Values of required columns that the recording does not contain.
 _NEUTRAL = {
-    "channel": 0, "class": 0, "intensity": 0, "object": -1, "reflectivity": 0, "return_number": 1,
-    "returns": 1, "signal": 0,
+    "channel": 0, "class": 0, "intensity": 0, "object": -1, "reflectivity": 0, "return_number": 0,
+    "returns": 0, "signal": 0,
 }  # fmt: skip
 # Columns that are always written if the recording contains them, or if they can be derived.
 _KEPT = ("time", "intensity", "reflectivity", "return_number", "returns", "class", "cause", *COLORS)
@@ -110,7 +110,7 @@ class FormatConverter(Rewriter):
                 f"The format {spec.format} requires the column {missing[0]}, which recordings do "
                 "not contain. Choose another format with `--format`."
             )
-        names = [name for name in dict.fromkeys((*_KEPT, *spec.needs)) if name != "scan"]
+        names = [name for name in dict.fromkeys((*_KEPT, *spec.added)) if name in known - {"scan"}]
         always = {column.name for column in ALWAYS}
         self._optional = tuple(TABLE[name] for name in names if name not in always)
         # Formats that store single sweeps receive the points in the sensor frame.
@@ -277,6 +277,7 @@ class FormatConverter(Rewriter):
             if name in summary.recorded and name not in _STRENGTHS
         ]
         notes = self._notes(summary, needed)
+        notes += [f"{spec.title} {text}." for text in spec.describe_empty_fields(cloud, sweeps)]
         if unsupported:
             notes.append(f"{spec.title} cannot store {join_names(unsupported)}.")
         return notes
@@ -327,7 +328,7 @@ class FormatConverter(Rewriter):
             precision_m=self._precision_m,
             epsg=None if self._in_sensor else self.recording.epsg,
             start_ns=epoch_ns if epoch_ns is not None and epoch_ns > _MIN_EPOCH_NS else None,
-            lidars=(LidarTraits(summary.channels, "strongest"),),
+            lidars=(LidarTraits(summary.channels, mode=""),),
         )
 
     def _notes(self, summary: _Summary, needed: set[str]) -> list[str]:

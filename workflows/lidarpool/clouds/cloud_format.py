@@ -18,6 +18,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from .format_row import FormatRow
+from .point_field import PointField
 from .recording import Recording, RecordingSource
 
 if TYPE_CHECKING:
@@ -67,10 +68,12 @@ class CloudFormat(ABC):
     title: ClassVar[str] = ""  # proper name for messages (default: name of the format)
     by_sweep: ClassVar[bool] = False  # whether the points of each sweep are stored separately
     frame: ClassVar[Frame] = "cloud"  # frame in which points are stored
-    # Columns that a cloud must have. If `by_sweep` is true, `scan` is required, too.
+    # Fields of a point, and the columns from which they are filled. A run adds these columns.
+    fields: ClassVar[tuple[PointField, ...]] = ()
+    other_columns: ClassVar[bool] = True  # whether columns without a field are stored as well
+    # Columns that a cloud must have in addition to those of required fields. If `by_sweep` is true,
+    # `scan` is required, too.
     required: ClassVar[tuple[str, ...]] = ()
-    stored: ClassVar[tuple[str, ...] | None] = None  # columns that can be stored; None for all
-    named: ClassVar[tuple[str, ...]] = ()  # columns that are only stored if classes have names
     options: ClassVar[tuple[str, ...]] = ()  # supported options of `ExportSpec`
     actor_boxes: ClassVar[bool] = False  # whether bounding boxes of actors are stored
     for_scenes: ClassVar[bool] = False  # whether scenes can be created from files of the format
@@ -117,25 +120,36 @@ class CloudFormat(ABC):
         del spec
 
     @classmethod
-    def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the additional columns that the options in `spec` require.
-
-        The format stores these columns.
-        """
-        return ()
+    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+        """Return the fields of a point with the options in `spec`."""
+        return cls.fields
 
     @classmethod
     def required_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
         """Return the columns that a cloud must have."""
-        scan = ("scan",) if cls.by_sweep else ()
-        required = (*scan, *cls.required, *cls.option_columns(spec))
-        time = ("time",) if spec.compensated_actors and "time" not in required else ()
-        return required + time
+        required = ("scan",) if cls.by_sweep else ()
+        required += cls.required
+        required += tuple(
+            name
+            for point_field in cls.fields_for(spec)
+            if point_field.is_required
+            for name in point_field.columns
+        )
+        if spec.compensated_actors:
+            required += ("time",)
+        return tuple(dict.fromkeys(required))
 
     @classmethod
-    def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
-        """Return the columns that the format can store, except those in `stored`."""
-        return cls.option_columns(spec) + (cls.named if sweeps.classes else ())
+    def stored_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> set[str] | None:
+        """Return the columns that the format can store, or None if it can store all columns."""
+        if cls.other_columns:
+            return None
+        return {
+            name
+            for point_field in cls.fields_for(spec)
+            if sweeps.classes or not point_field.if_named
+            for name in point_field.columns
+        }
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from threading import Lock
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.scene.files.intensity_scales import Limits, common_limits
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
+from lidarsim.sweeps.ray_image import RayImage
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import printable
 
@@ -29,11 +28,12 @@ from ..identity.fingerprint import fingerprint
 from ..processes.per_process import PerProcess
 from .cloud_format import CloudFormat
 from .gps_time import gps_start_s
+from .point_field import OMITTED, PointField
 from .recording import Recording, RecordingSource
+from .return_numbers import return_numbers
 from .well_known_text import wkt
 from .writing import ExportSpec
 
-_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "downsample it first"
 _COORDINATES = {
     "cartesian": ("cartesianX", "cartesianY", "cartesianZ"),
@@ -46,9 +46,16 @@ _COLUMNS = {
     **{f"color{color}": name for color, name in zip(_COLORS, COLORS, strict=True)},
     "rowIndex": "row",
     "columnIndex": "column",
+    "returnIndex": "return_number",
+    "returnCount": "returns",
+    "timeStamp": "time",
 }
 # Flags that mark points as invalid, and the columns to which they apply.
-_FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
+_FLAGS = {
+    "isIntensityInvalid": ("intensity",),
+    "isColorInvalid": COLORS,
+    "isTimeStampInvalid": ("time",),
+}
 _MOVING = ", motion compensated"  # suffix of the scan name if the sensor moves
 _MIN_QUATERNION = 1e-6  # norm below which a quaternion is considered zero
 
@@ -56,12 +63,14 @@ _MIN_QUATERNION = 1e-6  # norm below which a quaternion is considered zero
 class E57(CloudFormat):
     """An E57 file with one scan per sweep, except for sweeps without points.
 
-    A scan contains its pose and its points, which have intensity, colors and normals:
+    A scan contains its pose and its points, which have the fields in `E57.fields`:
 
     - Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
       stored as WKT.
     - Normals use the extension for surface normals. They are (0, 0, 0) if a point does not lie on a
       surface.
+    - Return indices start at 0. Time stamps are in seconds since the acquisition start. The row is
+      the channel, and the column is the firing in the sweep.
     - The intensity limits of all scans are 0 and the highest intensity in the cloud.
     - The acquisition start and end are the GPS times of the first and the last firing. The creation
       time is the start of the survey.
@@ -70,29 +79,37 @@ class E57(CloudFormat):
     title = "E57"
     by_sweep = True
     frame = "sweep"
-    stored = ("intensity", *COLORS, *NORMAL)
+    fields = (
+        PointField("intensity", ("intensity",), OMITTED),
+        PointField("returnIndex", ("return_number",), OMITTED),
+        PointField("returnCount", ("returns",), OMITTED),
+        PointField("timeStamp", ("time",), OMITTED),
+        PointField("rowIndex", ("channel", "ray"), OMITTED),
+        PointField("columnIndex", ("ray",), OMITTED),
+        PointField("colorRed, colorGreen, colorBlue", COLORS, OMITTED, on_request=True),
+        PointField("nor:normalX, nor:normalY, nor:normalZ", NORMAL, OMITTED, on_request=True),
+    )
+    other_columns = False
     for_scenes = True
 
     def write(self, path: Path, spec: ExportSpec) -> None:
         """Write the file."""
         from pye57 import libe57
 
-        from .e57_writer import E57Writer, E57WriterWithNormals, content_guids, normal_fields
+        from .e57_writer import NORMALS_URI, DateTime, E57Writer
 
-        content = fingerprint(self.sweeps, len(self.cloud), np.asarray(self.cloud.bounds))
-        normals = {*NORMAL} <= {column.name for column in self.cloud.table}
-        file_class, fields = (
-            (E57WriterWithNormals, normal_fields) if normals else (E57Writer, nullcontext)
-        )
-        system = "" if self.sweeps.epsg is None else wkt(self.sweeps.epsg)
+        sweeps = self.sweeps
+        content = fingerprint(sweeps, len(self.cloud), np.asarray(self.cloud.bounds))
+        system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
+        created = DateTime(gps_start_s(sweeps), sweeps.start_ns is not None)
         highest = _highest_intensity(self.cloud)
-        with content_guids(content), fields(), file_class(path, system, self.sweeps) as file:
-            if normals:
-                file.image_file.extensionsAdd("nor", _NORMALS_URI)
+        with E57Writer(path, system, created, content) as file:
+            if {*NORMAL} <= {column.name for column in self.cloud.table}:
+                file.image_file.extensionsAdd("nor", NORMALS_URI)
             try:
-                for sweep, points in enumerate(self.sweeps.points(self.cloud)):
+                for sweep, points in enumerate(sweeps.points(self.cloud)):
                     if len(points):
-                        _write_scan(file, self.sweeps, sweep, points, highest)
+                        _write_scan(file, sweeps, sweep, points, highest)
                 file.close()
             except libe57.E57Exception as error:
                 del file.image_file  # closing it would fail again
@@ -118,40 +135,45 @@ def _highest_intensity(cloud: CloudLike) -> float:
 def _write_scan(
     file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
 ) -> None:
-    from .e57_writer import NORMAL_FIELDS
+    from .e57_writer import DateTime, ScanHeader
 
-    positions = sweeps.compensate_motion(sweep, points)
-    x, y, z = positions.T.copy()
-    data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
-    if "intensity" in points.columns:
-        data["intensity"] = points["intensity"]
-    if {*COLORS} <= {*points.columns}:
-        data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
-    if {*NORMAL} <= {*points.columns}:
-        columns = sweeps.columns_compensated(sweep, points)
-        data |= {field: np.nan_to_num(columns[name]) for field, name in NORMAL_FIELDS.items()}
-    quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
-    position = sweeps.pose.positions[sweep]
     start_s = gps_start_s(sweeps)
-    # Without these fields, pye57 writes zeros, the limits of each scan, and bounds in world
-    # coordinates. The format requires bounds in the frame of the points.
-    header: dict[str, Any] = {
-        "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
-        "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
-        "acquisitionStart_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "acquisitionEnd_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "intensityMinimum": 0.0,
-        "intensityMaximum": highest_intensity,
-    }
-    for axis, low, high in zip("xyz", positions.min(axis=0), positions.max(axis=0), strict=True):
-        header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
-    file.write_scan_raw(
-        data,
-        name=_scan_name(sweeps, sweep),
-        rotation=quaternion,
-        translation=position,
-        scan_header=SimpleNamespace(**header),
+    is_dated = sweeps.start_ns is not None
+    header = ScanHeader(
+        _scan_name(sweeps, sweep),
+        sweeps.pose.positions[sweep],
+        np.roll(sweeps.pose.quaternions[sweep], 1),  # w first
+        DateTime(start_s + float(sweeps.begins_ns[sweep]) / 1e9, is_dated),
+        DateTime(start_s + float(sweeps.ends_ns[sweep]) / 1e9, is_dated),
+        highest_intensity,
     )
+    file.write_scan(header, _point_fields(sweeps, sweep, points))
+
+
+def _point_fields(sweeps: Sweeps, sweep: int, points: Cloud) -> dict[str, AnyArray]:
+    """Return the values of a sweep's points by field of the format, as far as they are known."""
+    positions = sweeps.compensate_motion(sweep, points)
+    fields: dict[str, AnyArray] = dict(zip(_COORDINATES["cartesian"], positions.T, strict=True))
+    columns = points.columns
+    if "intensity" in columns:
+        fields["intensity"] = points["intensity"]
+    if {*COLORS} <= columns.keys():
+        names = zip(_COLORS, COLORS, strict=True)
+        fields |= {f"color{color}": points[name] for color, name in names}
+    if "ray" in columns and sweeps.fired is not None:
+        image = RayImage.from_points(sweeps, sweep, points)
+        fields |= {"rowIndex": image.row, "columnIndex": image.column}
+    if (numbers := return_numbers(points, sweeps)) is not None:
+        number, returns = numbers
+        fields |= {"returnIndex": number.astype(np.int64) - 1, "returnCount": returns}
+    if "time" in columns:
+        fields["timeStamp"] = (points["time"] - sweeps.begins_ns[sweep]) / 1e9
+    if {*NORMAL} <= columns.keys():
+        compensated = sweeps.columns_compensated(sweep, points)
+        fields |= {
+            f"nor:normal{name[-1].upper()}": np.nan_to_num(compensated[name]) for name in NORMAL
+        }
+    return fields
 
 
 def _scan_name(sweeps: Sweeps, sweep: int) -> str:
@@ -209,7 +231,8 @@ def _open_e57(source: RecordingSource) -> Recording:
             # E57 coordinates are in meters. They cannot be in a system that uses another unit.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
         names = [_stated_name(header) for header in headers]
-        stations = [] if any(name.endswith(_MOVING) for name in names) else names
+        is_compensated = any(name.endswith(_MOVING) for name in names)
+        stations = [] if is_compensated else names
     return source.recording(
         len(headers),
         read,
@@ -219,6 +242,7 @@ def _open_e57(source: RecordingSource) -> Recording:
         epsg=epsg,
         is_metric=True,
         stations=tuple(stations),
+        compensated=True if is_compensated else None,
     )
 
 
@@ -236,6 +260,8 @@ def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
         raise ValueError(f"{scan_name} has neither Cartesian nor spherical coordinates")
     read = _read_fields(file, header)
     columns = {name: read[field] for field, name in _COLUMNS.items() if field in read}
+    if "return_number" in columns:  # numbers start at 0 in files
+        columns["return_number"] = columns["return_number"] + 1
     if {*COLORS} <= columns.keys():
         columns |= _color_columns(header, columns)
     if (limits := scale.limits[number]) is not None:

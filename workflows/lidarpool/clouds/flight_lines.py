@@ -17,6 +17,7 @@ from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 _MAX_SOURCE = 65_535  # largest point source ID in the format
+_MAX_SCANNERS = 4  # number of scanner channels in the format
 _MIN_STEP_M = 1e-6  # distance in 2 ms, or in a sweep, above which a platform is moving
 _SAMPLE_S = 0.05  # interval at which trajectories are sampled to find flight lines
 _MAX_SAMPLES = 200_000
@@ -81,6 +82,7 @@ class LineFields:
     # (k,): number of the flight line or station and of the sensor, from 1. 0 if it is too large.
     source: Ints
     line: Ints  # (k,): scan line number, unique in the survey, or -1 if there is no mirror
+    scanner: Bytes  # (k,): number of the scanner on the platform, from 0. 0 if it is too large.
 
     @classmethod
     def empty(cls, count: int) -> LineFields:
@@ -91,6 +93,7 @@ class LineFields:
             np.zeros(count, np.bool_),
             np.zeros(count, np.int64),
             np.full(count, -1, np.int64),
+            np.zeros(count, np.uint8),
         )
 
 
@@ -169,6 +172,7 @@ class FlightLines:
         source = self._sources[sweep]
         fields.source[row_indices] = source if source <= _MAX_SOURCE else 0
         sensor = int(sweeps.sensor[sweep])
+        fields.scanner[row_indices] = self._scanners[sensor]
         mirror = sweeps.lidars[sensor].lines if sweeps.lidars else None
         if mirror is None:
             return
@@ -179,6 +183,19 @@ class FlightLines:
         against = sweeps.pose.rotations[sweep][:, 0] @ self._directions[sweep] < 0
         fields.direction[row_indices] = mirror.runs_leftward(line) == int(against)
         fields.line[row_indices] = (sensor * sweeps.stations + station) * _LINES + line
+
+    @cached_property
+    def _scanners(self) -> Bytes:
+        """Scanner of each sensor, starting at 0.
+
+        Sensors with the same mount are the same scanner, for example if each flight line has its
+        own entry. If there are more scanners than the format supports, all are 0.
+        """
+        mounts = self.sweeps.mounts
+        rows = np.concatenate([mounts.positions, mounts.quaternions], axis=1).round(6) + 0.0
+        numbers: dict[bytes, int] = {}
+        scanners = [numbers.setdefault(row.tobytes(), len(numbers)) for row in rows]
+        return np.array(scanners if len(numbers) <= _MAX_SCANNERS else [0] * len(rows), np.uint8)
 
     @cached_property
     def _directions(self) -> Floats:

@@ -28,6 +28,7 @@ from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat
+from .point_field import PointField
 from .recording import Recording, RecordingSource
 
 _NO_IMAGES = ("pose", "scan", "frame")  # arrays in a file that are not images
@@ -54,7 +55,10 @@ class ImageFolder(MultiFileFormat):
 
     title = "range images"
     by_sweep = True
-    required = ("ray", "range")
+    fields = (
+        PointField("row and column of the pixel", ("ray",)),
+        PointField("range", ("range",)),
+    )
     file_pattern = r"[^/]+/\d+\.npz"
     job_path = "images/{name}"
     separate_sweeps = True

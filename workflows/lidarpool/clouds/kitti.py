@@ -36,6 +36,7 @@ from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes, as_npy
+from .point_field import OMITTED, PointField
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
@@ -88,8 +89,13 @@ class KITTI(MultiFileFormat):
     title = "KITTI"
     by_sweep = True
     frame = "sweep"
-    required = ("object", "reflectivity", "class")
-    stored = (*required, *FLOW)
+    fields = (
+        PointField("instance of the label", ("object",)),
+        PointField("reflectance", ("reflectivity",)),
+        PointField("class of the label", ("class",)),
+        PointField("flow", FLOW, OMITTED, on_request=True),
+    )
+    other_columns = False
     actor_boxes = True
     file_pattern = _FILE_PATTERN
     separate_sweeps = True

@@ -33,7 +33,9 @@ from .flight_lines import FlightLines
 from .gps_time import gps_start_s
 from .intensity_full_scale import compute_full_scale
 from .las_header import las_system, noise_classes, open_las
+from .point_field import NONE, OMITTED, PointField
 from .recording import Recording, RecordingSource
+from .return_numbers import return_numbers
 from .well_known_text import wkt
 from .writing import ExportSpec
 
@@ -48,6 +50,7 @@ _SYSTEM_POINTS = 5  # points at which the lengths in a coordinate system are che
 ANGLE_DEG = 0.006  # step of the format's scan angle
 _MAX_INTENSITY = 65_535
 _FULL_SCALE = 2  # ID of lidarpool's record with the intensity that is stored as the maximum
+_MAX_RETURNS = 15  # largest return number in point formats 6 to 10
 _FORMAT_FIELDS = ("return_number", "returns")  # columns that are not stored in extra bytes
 # Names of columns in the extra bytes. The format already has a field `intensity`, and normals are
 # named like dimensions of PDAL.
@@ -87,9 +90,10 @@ class LAS(CloudFormat):
 
     - GPS time: `time` as adjusted standard GPS time, or in seconds since the start of the survey if
       the date of the survey is unknown.
-    - Return number and number of returns: `return_number` and `returns`, at most 15.
-    - Scan angle (in steps of 0.006 degrees), scan direction, edge of flight line and point source:
-      see `FlightLines`.
+    - Return number and number of returns: `return_number` and `returns`, at most 15, or 1 if the
+      sensors report one return per pulse.
+    - Scan angle (in steps of 0.006 degrees), scan direction, edge of flight line, point source and
+      scanner channel: see `FlightLines`.
     - Red, green and blue: the columns of these names, multiplied by 257.
     - Intensity: `intensity`, scaled so that `intensity_full_scale` is stored as 65,535. Greater
       intensities are clipped. A record of lidarpool contains the scale as JSON.
@@ -97,12 +101,29 @@ class LAS(CloudFormat):
       classes, which are truncated to 15 ASCII characters.
 
     All columns except return numbers, numbers of returns and colors are also stored in the extra
-    bytes, without these limits. The coordinate system is stored as WKT, the names of materials as
+    bytes, without these limits. Fields whose values are unknown are 0. The coordinate system is stored as WKT, the names of materials as
     JSON in a record of lidarpool, and the frame of the points in a text area record.
     """
 
     title = "LAS"
     frame = "world"
+    fields = (
+        PointField("intensity", ("intensity",), "0"),
+        PointField("return number", ("return_number",), "0"),
+        PointField("number of returns", ("returns",), "0"),
+        PointField("synthetic, key-point, withheld and overlap flags", (), "0", NONE),
+        PointField("scanner channel", (), "0", "mounts of the sensors"),
+        PointField("scan direction flag", (), "0", "motion of the mirror"),
+        PointField("edge of flight line", (), "0", "motion of the mirror"),
+        PointField("classification", ("class",), "0"),
+        PointField("user data", (), "0", NONE),
+        PointField("scan angle", (), "0", "poses of the sensors"),
+        PointField("point source ID", (), "0", "flight lines and stations"),
+        PointField("GPS time", ("time",), "0"),
+        PointField("red, green, blue", COLORS, OMITTED, on_request=True),
+        PointField("near infrared", (), OMITTED, NONE),
+        PointField("wave packets", (), OMITTED, "`cloud.waveform_samples`"),
+    )
     options = ("intensity_full_scale",)
     is_compressed: ClassVar[bool] = False
     for_scenes = True
@@ -131,13 +152,14 @@ class LAS(CloudFormat):
             ):
                 with laspy.open(file, "w", **options) as writer:
                     for chunk, lines in FlightLines(self.sweeps).with_fields(self.cloud.chunks()):
-                        points = _points(chunk, header, names, _start_s(self.sweeps))
+                        points = _points(chunk, header, names, self.sweeps)
                         if full_scale is not None:
                             points.intensity = _as_integers(chunk["intensity"], full_scale)
                         points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype("i2")
                         points.scan_direction_flag = lines.direction
                         points.edge_of_flight_line = lines.edge
                         points.point_source_id = lines.source
+                        points.scanner_channel = lines.scanner
                         if packets is not None:
                             packets.put(points, chunk, packet_file)
                         with defer_interrupts():  # lazrs replaces errors raised within it
@@ -309,17 +331,18 @@ class _Packets:
         file.write(_WAVES.pack(begin, begin, 1))
 
 
-def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: float) -> Any:
+def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], sweeps: Sweeps) -> Any:
     import laspy
 
     record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
     record.x, record.y, record.z = chunk.positions.T.astype(np.float64)
     columns = chunk.columns
-    single = np.ones(len(chunk), np.uint8)
-    record.return_number = np.minimum(columns.get("return_number", single), 15)
-    record.number_of_returns = np.minimum(columns.get("returns", single), 15)
+    if (numbers := return_numbers(chunk, sweeps)) is not None:
+        record.return_number, record.number_of_returns = (
+            np.minimum(values, _MAX_RETURNS) for values in numbers
+        )
     if "time" in columns:
-        record.gps_time = columns["time"] / 1e9 + start_s
+        record.gps_time = columns["time"] / 1e9 + _start_s(sweeps)
     if "class" in columns:
         record.classification = np.where(columns["class"] < 256, columns["class"], 0).astype(
             np.uint8

@@ -35,6 +35,7 @@ from .boxes import Boxes, json_number
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes
+from .point_field import OMITTED, PointField
 from .recorded_boxes import RecordedBoxes
 from .recording import Recording, RecordingSource, sweep_from_columns
 
@@ -94,9 +95,13 @@ class NuScenes(MultiFileFormat):
     title = "nuScenes"
     by_sweep = True
     frame = "sweep"
-    required = ("object", "channel", "intensity")
-    stored = ("channel", "intensity")
-    named = ("class",)
+    fields = (
+        PointField("intensity", ("intensity",)),
+        PointField("ring", ("channel",)),
+        PointField("lidarseg", ("class",), OMITTED, if_named=True),
+    )
+    other_columns = False
+    required = ("object",)
     actor_boxes = True
     file_pattern = _FILE_PATTERN
     separate_sweeps = True

@@ -26,6 +26,7 @@ from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import CloudFormat
 from .gps_time import GPS_NS
+from .point_field import NONE, OMITTED, PointField
 from .writing import ExportSpec
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
@@ -61,8 +62,19 @@ class OSI(CloudFormat):
     title = "OSI"
     by_sweep = True
     frame = "sweep"
-    required = ("object", "channel", "intensity")
-    stored = (*required, "reflectance", "radial_velocity", "sensor")
+    fields = (
+        PointField("object_id", ("object",)),
+        PointField("beam_id", ("channel",)),
+        PointField("intensity", ("intensity",)),
+        PointField("reflectivity", ("reflectance",), OMITTED),
+        # Most sensors do not measure velocities.
+        PointField("radial_velocity", ("radial_velocity",), OMITTED, on_request=True),
+        PointField("sensor_id", ("sensor",), OMITTED, on_request=True),
+        PointField("existence_probability, position_rmse", (), OMITTED, NONE),
+        PointField("free_space_probability, classification", (), OMITTED, NONE),
+        PointField("echo_pulse_width", (), OMITTED, NONE),
+    )
+    other_columns = False
     actor_boxes = True
     suffix: ClassVar[str] = ".osi"  # extension by which betterosi selects the type of trace
 

@@ -15,6 +15,7 @@ from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import make_identifiers
 
 from .cloud_format import CloudFormat
+from .point_field import OMITTED, PointField
 from .recording import Recording, RecordingSource, sweep_from_columns
 from .writing import ExportSpec
 
@@ -30,8 +31,16 @@ class PacketCapture(CloudFormat):
     title = "PCAP"
     by_sweep = True
     frame = "none"
-    required = ("ray", "range")
-    stored = ("scan", "sensor", "channel", "ray", "range", "time", "reflectivity", "signal")
+    fields = (
+        PointField("firing and laser", ("scan", "ray", "channel")),
+        PointField("distance", ("range",)),
+        # `survey_columns` adds the columns that the protocols of the sensors contain.
+        PointField("reflectivity", ("reflectivity",), OMITTED, on_request=True),
+        PointField("signal", ("signal",), OMITTED, on_request=True),
+        PointField("timestamp", ("time",), "computed from the firing", on_request=True),
+        PointField("sensor", ("sensor",), "one file per sensor", on_request=True),
+    )
+    other_columns = False
     file_pattern = r"[^/]+\.(pcap|json)"
 
     @classmethod

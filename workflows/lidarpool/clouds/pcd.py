@@ -21,7 +21,9 @@ from lidarsim.sweeps.sweeps import states_compensation
 
 from ..processes.per_process import PerProcess
 from .multi_file_format import MultiFileFormat
+from .point_field import OMITTED, PointField
 from .recording import Recording, RecordingSource
+from .writing import ExportSpec
 
 _COMMENT_BYTES = 1000  # maximum number of bytes that are read from the first line
 
@@ -42,9 +44,20 @@ class PCD(MultiFileFormat):
     title = "PCD"
     by_sweep = True
     frame = "firing"
+    fields = (
+        PointField("intensity", ("intensity",), OMITTED),
+        PointField("time", ("time",), OMITTED),
+        PointField("rgb", COLORS, OMITTED, on_request=True),
+        PointField("normal_x, normal_y, normal_z", NORMAL, OMITTED, on_request=True),
+    )
     options = ("compensated",)
     file_pattern = r"\d+\.pcd"
     for_scenes = True
+
+    @classmethod
+    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+        """Return the fields of a point, which has no time if it is motion-compensated."""
+        return tuple(f for f in cls.fields if f.name != "time" or not spec.compensated)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return the file of a sweep."""

@@ -20,6 +20,7 @@ from lidarview.render.coloring import TURBO
 
 from .cloud_format import CloudFormat
 from .frame_names import VEHICLE, WORLD
+from .point_field import OMITTED, PointField
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
 from .writing import ExportSpec
 
@@ -60,6 +61,11 @@ class RRD(CloudFormat):
     title = "RRD"
     by_sweep = True
     frame = "sweep"
+    fields = (
+        PointField("colors", ("intensity",), "the height"),
+        PointField("colors of surfaces", COLORS, OMITTED, on_request=True),
+        PointField("class_ids", ("class",), OMITTED, if_named=True),
+    )
     required = ("object",)
     actor_boxes = True
 

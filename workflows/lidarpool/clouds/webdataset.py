@@ -27,6 +27,7 @@ from .boxes import Boxes, SweepBoxes, json_number
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange, as_npy
+from .point_field import PointField
 from .recording import Recording, RecordingSource
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
@@ -56,7 +57,7 @@ class WebDataset(MultiFileFormat):
 
     title = "WebDataset"
     by_sweep = True
-    required = ("object", "intensity", "class")
+    fields = tuple(PointField(name, (name,)) for name in ("object", "intensity", "class"))
     actor_boxes = True
     file_pattern = r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz"
     separate_sweeps = True

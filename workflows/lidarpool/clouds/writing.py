@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.table import SCAN
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.storage import Storage, flush
@@ -32,6 +33,8 @@ from .folder import staging
 from .format_row import FormatRow
 from .format_table import EXPORTS, FORMATS, LAYOUTS, format_row, load_format
 from .multi_file_format import MultiFileFormat, RangeWorkers
+from .point_field import OMITTED, PointField
+from .return_numbers import known_columns
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
@@ -158,33 +161,107 @@ class ExportSpec(FileSection):
         """Names of the columns that a cloud must have."""
         return self.cloud_format.required_columns(self)
 
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of the columns that a run computes for fields of the format without being asked.
+
+        They include the columns that a cloud must have.
+        """
+        fields = self.cloud_format.fields_for(self)
+        names = (name for field in fields if not field.on_request for name in field.columns)
+        return tuple(dict.fromkeys((*self.needs, *names)))
+
+    def columns_for(self, survey: Survey) -> tuple[str, ...]:
+        """Return the names of the columns that the simulation of a survey knows for the format.
+
+        They are `added`, without classes that no material has or that cannot be stored, and the
+        columns that the sensors require in the format. Raises LidarError if the format does not
+        support a sensor.
+        """
+        has_classes = any(material.semantic_class for material in survey.materials)
+        only_named = "class" in self._only_named and not survey.classes
+        unknown = {"class"} if only_named or not has_classes else set()
+        names = (name for name in self.added if name in self.needs or name not in unknown)
+        return (*names, *self.cloud_format.survey_columns(survey))
+
+    @property
+    def _only_named(self) -> set[str]:
+        """Names of the columns that the format stores only if classes have names."""
+        fields = self.cloud_format.fields_for(self)
+        return {name for field in fields if field.if_named for name in field.columns}
+
     def configure_sweeps(self, sweeps: Sweeps) -> Sweeps:
         """Set how sweeps position their points, according to the options of the format."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def unsupported_columns(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return the names of the columns that the format cannot store."""
-        stored = self.cloud_format.stored
+        stored = self.cloud_format.stored_columns(self, sweeps)
         names = (column.name for column in cloud.table)
         if stored is None:
             return [name for name in names if name == "time" and self.compensated]
-        stored += self.cloud_format.optional_columns(self, sweeps)
         return [name for name in names if name not in stored]
 
+    def empty_fields(
+        self, cloud: CloudLike, sweeps: Sweeps, survey: Survey | None = None
+    ) -> list[PointField]:
+        """Return the fields that a run would fill, but whose columns the cloud does not contain.
+
+        Columns that the simulation of `survey` does not know, such as classes that no material has,
+        are ignored.
+        """
+        known = known_columns([column.name for column in cloud.table], sweeps)
+        if survey is not None:
+            known |= {*self.added} - {*self.columns_for(survey)}
+        return [
+            field
+            for field in self.cloud_format.fields_for(self)
+            if not (field.on_request or field.is_required or known >= {*field.columns})
+            and (sweeps.classes or not field.if_named)
+        ]
+
+    def describe_empty_fields(
+        self, cloud: CloudLike, sweeps: Sweeps, survey: Survey | None = None
+    ) -> list[str]:
+        """Describe what the format stores in the fields that `empty_fields` returns.
+
+        The result contains a text such as "stores 0 as GPS time, because the cloud has no column
+        time" for each stored value.
+        """
+        fields = self.empty_fields(cloud, sweeps, survey)
+        present = {column.name for column in cloud.table}
+        texts = []
+        for stored in dict.fromkeys(field.missing for field in fields):
+            group = [field for field in fields if field.missing == stored]
+            names = (name for field in group for name in field.columns if name not in present)
+            columns = dict.fromkeys(names)
+            verb = "omits" if stored == OMITTED else f"stores {stored} as"
+            noun = "column" if len(columns) == 1 else "columns"
+            texts.append(
+                f"{verb} {join_names([field.name for field in group])}, because the cloud has no "
+                f"{noun} {join_alternatives([*columns])}"
+            )
+        return texts
+
     def notes(
-        self, cloud: CloudLike, sweeps: Sweeps, requested: Collection[str] | None = None
+        self,
+        cloud: CloudLike,
+        sweeps: Sweeps,
+        requested: Collection[str] | None = None,
+        survey: Survey | None = None,
     ) -> list[str]:
         """Return notes for the user about differences between the cloud and the file.
 
         `requested` are the columns that the user requested, or None if this is unknown. There is no
         note about the omission of columns that only exist because another format requires them.
+        `survey` is the survey of the cloud, or None if it is unknown.
         """
         unsupported_columns = [
             name
             for name in self.unsupported_columns(cloud, sweeps)
             if self._is_missed(name, requested)
         ]
-        unnamed = [name for name in unsupported_columns if name in self.cloud_format.named]
+        unnamed = [name for name in unsupported_columns if name in self._only_named]
         strengths = [name for name in self.needs if name in _STRENGTHS]
         replaced = [name for name in unsupported_columns if strengths and name in _STRENGTHS]
         unsupported = ", ".join(
@@ -201,6 +278,10 @@ class ExportSpec(FileSection):
                 "ground, …}`; see docs/how-to/labels.md"
             )
             for name in unnamed
+        ]
+        notes += [
+            f"{self.title} {text}. Run the survey again with `output: {{write: [{self._entry}]}}`"
+            for text in self.describe_empty_fields(cloud, sweeps, survey)
         ]
         notes += self.frame_notes(sweeps.coordinates)
         return notes + self.cloud_format.renaming_notes(sweeps.sensors)
@@ -366,14 +447,13 @@ class ExportSpec(FileSection):
 
 
 def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
-    """Return a survey with the additional columns that its sensors require in these formats.
+    """Return a survey with the columns that the simulation knows for these formats.
 
     Raises LidarError if a format does not support a sensor.
     """
-    names = dict.fromkeys(
-        name for spec in specs for name in spec.cloud_format.survey_columns(survey)
-    )
-    return replace(survey, columns=(*survey.columns, *names)) if names else survey
+    names = dict.fromkeys(name for spec in specs for name in spec.columns_for(survey))
+    has_all = names.keys() <= {SCAN.name, *(column.name for column in survey.stored_columns)}
+    return survey if has_all else replace(survey, columns=(*survey.columns, *names))
 
 
 def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:

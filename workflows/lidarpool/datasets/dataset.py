@@ -150,8 +150,8 @@ class DataSet:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that each job's cloud must have."""
-        return self.spec.needs
+        """Names of the columns that each job computes for the files."""
+        return self.spec.added
 
     def check_installed(self) -> None:
         """Raise LidarError if a package that the format requires is not installed."""

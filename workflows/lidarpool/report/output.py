@@ -290,7 +290,9 @@ class SurveyOutput:
             report = make_report(result, counts)
             report |= describe_flight(self.scenario, result.scene, counts)
             for output_format in self.formats:
-                report["notes"] += output_format.notes(result.points, sweeps, self._requested)
+                report["notes"] += output_format.notes(
+                    result.points, sweeps, self._requested, result.survey
+                )
             if full_scales:
                 report["intensity_full_scale"] = full_scales
             if self.extent != "cloud":

@@ -185,7 +185,7 @@ class _Casting:
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
-        columns = stream.campaign.keep.export_spec.needs
+        columns = stream.campaign.keep.export_spec.added
         self._maker = JobProducer(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _StreamedSweeps] = {}  # {job number: sweeps}
         self._next: _StreamedSweeps | None = None  # job with sweeps that have not been begun yet

@@ -703,13 +703,14 @@ def _class_names(
 
     The names are taken from `scenario.classes`, and from the classes that files assign to objects,
     unless the scenario uses the number or the name for a different class. `columns` are the columns
-    of the cloud.
+    of the cloud, besides those that the formats store if there are classes.
     """
     entries = (*scenario.object_entries, *(scenario.traffic.vehicles if scenario.traffic else ()))
     scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
     numbers: dict[str, int] = {}  # {class name: number}
-    if scenario.classes or "class" in columns:
+    format_columns = {name for spec in scenario.output.write for name in spec.added}
+    if scenario.classes or "class" in (*columns, *format_columns):
         numbers = {
             name: number for number, name in findings.class_names.items() if number in file_classes
         }

@@ -34,6 +34,7 @@ _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 
 Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "two_strongest", "all"]
+SINGLE_RETURN: tuple[Mode, ...] = ("strongest", "first", "last")  # modes with one return
 TWO_RETURNS: tuple[Mode, ...] = ("dual", "two_strongest")  # modes with at most two returns
 
 

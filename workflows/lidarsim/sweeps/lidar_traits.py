@@ -50,7 +50,7 @@ class LidarTraits:
     """Sensor properties that determine the values of fields in output files."""
 
     channels: int
-    mode: str  # return mode; see `Returns`
+    mode: str  # return mode; see `Returns`. Empty if unknown
     zero_deg: float = 0.0  # azimuth at which the head starts, counterclockwise from the x axis
     firing_ns: float = 0.0  # time between the first and last beam of a firing
     # Difference between the ranges that the sensor reports and the distances from the beam origin.

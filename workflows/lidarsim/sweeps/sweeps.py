@@ -34,7 +34,7 @@ from ..numerics.arrays import (
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Sensor
-from ..sensor.optics import TWO_RETURNS
+from ..sensor.optics import SINGLE_RETURN, TWO_RETURNS
 from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..survey.faults import Fault
 from ..survey.survey import Survey, nanoseconds
@@ -308,6 +308,11 @@ class Sweeps:
         scans.
         """
         return self._sensor_firing_poses(sweep, self._shares(sweep, points))
+
+    @property
+    def has_single_returns(self) -> bool:
+        """Whether no sensor reports more than one return per pulse. False if this is unknown."""
+        return bool(self.lidars) and all(lidar.mode in SINGLE_RETURN for lidar in self.lidars)
 
     def span_ns(self, sweep: int) -> float:
         """Return the duration from the start of a sweep to its last beam, in nanoseconds."""

@@ -43,6 +43,7 @@ from .. import laser_scan
 from ..cloud_format import CloudFormat, PointColumns
 from ..frame_names import WORLD, survey_start_ns
 from ..job_reader import JobReader
+from ..point_field import OMITTED, PointField
 from ..recorded_boxes import RecordedBoxes
 from ..recording import Recording, RecordingSource, sweep_from_columns
 from ..writing import ExportSpec
@@ -108,9 +109,15 @@ class Rosbag2(CloudFormat):
     title = "rosbag2"
     by_sweep = True
     frame = "firing"
-    required = ("object", "channel")
-    stored = ("channel", *COLORS, "radial_velocity", *SURFACE_COLUMNS, "material")
-    named = ("class",)
+    fields = (
+        PointField("rgb", COLORS, OMITTED, on_request=True),
+        PointField("radial_velocity", ("radial_velocity",), OMITTED, on_request=True),
+        PointField("label", ("class",), OMITTED, on_request=True, if_named=True),
+        PointField("fields of the surface", SURFACE_COLUMNS, OMITTED, on_request=True),
+        PointField("material", ("material",), OMITTED, on_request=True),
+    )
+    other_columns = False
+    required = ("object",)
     options = ("layout", "compensated", "pose_rate_hz", "organized")
     actor_boxes = True
     file_pattern = r"metadata\.yaml|rosbag2\w*\.mcap"
@@ -151,18 +158,20 @@ class Rosbag2(CloudFormat):
             )
 
     @classmethod
-    def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the names of the columns that the layout requires."""
-        columns = LAYOUTS[spec.layout].columns
-        if spec.organized and "ray" not in columns:
-            columns = (*columns, "ray")
-        return tuple(name for name in columns if name != "time" or not spec.compensated)
+    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+        """Return the fields of the layout, followed by those that depend on the cloud."""
+        layout = LAYOUTS[spec.layout]
+        fields = layout.point_fields
+        if spec.compensated:
+            fields = tuple(f for f in fields if f.name != layout.time_field)
+        organized = (PointField("row and column", ("ray",)),) if spec.organized else ()
+        return (*fields, *organized, *cls.fields)
 
     @classmethod
-    def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
+    def stored_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> set[str] | None:
         """Return the columns that can be stored, including the columns of LaserScan messages."""
-        columns = super().optional_columns(spec, sweeps)
-        return columns + (laser_scan.COLUMNS if laser_scan.has_laser_scans(sweeps) else ())
+        columns = super().stored_columns(spec, sweeps) or set()
+        return columns | {*(laser_scan.COLUMNS if laser_scan.has_laser_scans(sweeps) else ())}
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:

@@ -14,27 +14,28 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, SURFACE_COLUMNS, VELOCITY
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Records
 from lidarsim.scene.colors import pack_as_float
-from lidarsim.sensor.optics import TWO_RETURNS
+from lidarsim.sensor.optics import SINGLE_RETURN, TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..frame_names import survey_start_ns
+from ..point_field import NONE, PointField
 
 # Return types in Autoware.
 UNKNOWN, LAST, FIRST, STRONGEST, FIRST_WEAK, LAST_WEAK = range(6)
 IDENTICAL, SECOND, _, FIRST_STRONGEST, LAST_STRONGEST = range(6, 11)
-_SINGLE_RETURN_TYPES = {"strongest": STRONGEST, "first": FIRST, "last": LAST}
+_SINGLE_RETURN_TYPES = dict(zip(SINGLE_RETURN, (STRONGEST, FIRST, LAST), strict=True))
 
 _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 _XYZI = [*_XYZ, ("intensity", "<f4")]
 # Additional fields after the layout: {name: (type, columns that the field requires)}.
 EXTRA_FIELDS = {
-    "rgb": ("<f4", {*COLORS}),
-    VELOCITY: ("<f4", {VELOCITY}),
-    "label": ("<u4", {"class"}),
-    **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
-    "material": ("<i4", {"material"}),
+    "rgb": ("<f4", COLORS),
+    VELOCITY: ("<f4", (VELOCITY,)),
+    "label": ("<u4", ("class",)),
+    **{name: ("<f4", (name,)) for name in SURFACE_COLUMNS},
+    "material": ("<i4", ("material",)),
 }
 
 
@@ -55,8 +56,8 @@ class PointLayout(ABC):
         Name of the ring field.
     full_intensity
         Value of the field `intensity` for an intensity of 1, or for the maximum reflectivity.
-    columns
-        Columns that the layout requires and stores, in addition to those of all bags.
+    point_fields
+        Fields except the position, with the columns from which they are filled.
     lines
         Rows of an organized cloud: "firings", "channels", or an empty string if the driver does not
         publish organized clouds.
@@ -66,7 +67,7 @@ class PointLayout(ABC):
 
     fields: ClassVar[np.dtype[np.void]]
     compensated_fields: ClassVar[np.dtype[np.void]]
-    columns: ClassVar[tuple[str, ...]]
+    point_fields: ClassVar[tuple[PointField, ...]]
     time_field: ClassVar[str]
     ring_field: ClassVar[str] = "ring"
     full_intensity: ClassVar[float] = 1
@@ -125,7 +126,11 @@ class PointLayout(ABC):
 class VelodyneLayout(PointLayout):
     """Layout of velodyne_pointcloud, with times in seconds since the timestamp."""
 
-    columns: ClassVar[tuple[str, ...]] = ("intensity", "time")
+    point_fields: ClassVar[tuple[PointField, ...]] = (
+        PointField("intensity", ("intensity",)),
+        PointField("ring", ("channel",)),
+        PointField("time", ("time",)),
+    )
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")])
     compensated_fields = np.dtype(fields.descr[:-1])
     time_field = "time"
@@ -154,7 +159,10 @@ class ImagesLayout(VelodyneLayout):
     Range images require all returns.
     """
 
-    columns = ("intensity", "time", "ray", "range")
+    point_fields = (
+        *VelodyneLayout.point_fields,
+        PointField("pixel of the range image", ("ray", "range")),
+    )
 
 
 class _CountedNanoseconds(PointLayout):
@@ -176,7 +184,13 @@ class AutowareLayout(_CountedNanoseconds):
     Points are PointXYZIRCAEDT, or PointXYZIRC if they are motion-compensated.
     """
 
-    columns = ("intensity", "time", "return_number", "returns")
+    point_fields = (
+        PointField("intensity", ("intensity",)),
+        PointField("return_type", ("return_number", "returns")),
+        PointField("channel", ("channel",)),
+        PointField("azimuth, elevation, distance", (), source="position"),
+        PointField("time_stamp", ("time",)),
+    )
     fields = np.dtype([
         *_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "<u2"), ("azimuth", "<f4"),
         ("elevation", "<f4"), ("distance", "<f4"), ("time_stamp", "<u4"),
@@ -203,7 +217,14 @@ class AutowareLayout(_CountedNanoseconds):
 class OusterLayout(_CountedNanoseconds):
     """Layout `original` of ouster-ros, in which ring 0 is the highest beam."""
 
-    columns = ("signal", "time", "reflectivity", "range")
+    point_fields = (
+        PointField("intensity", ("signal",)),
+        PointField("t", ("time",)),
+        PointField("reflectivity", ("reflectivity",)),
+        PointField("ring", ("channel",)),
+        PointField("ambient", (), "0", NONE),
+        PointField("range", ("range",)),
+    )
     fields = np.dtype({
         "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
         "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
@@ -238,7 +259,11 @@ class OusterLayout(_CountedNanoseconds):
 class _Reflectivities(PointLayout):
     """Base class for layouts with absolute times, whose intensity is the reflectivity."""
 
-    columns = ("reflectivity", "time")
+    point_fields = (
+        PointField("intensity", ("reflectivity",)),
+        PointField("ring", ("channel",)),
+        PointField("timestamp", ("time",)),
+    )
     full_intensity = 255
     unit_ns: ClassVar[float] = 1e9  # unit of the time field in nanoseconds
 
@@ -293,6 +318,12 @@ class LivoxLayout(_Reflectivities):
     The tag of all points is 0, which marks normal points.
     """
 
+    point_fields = (
+        PointField("intensity", ("reflectivity",)),
+        PointField("tag", (), "0", NONE),
+        PointField("line", ("channel",)),
+        PointField("timestamp", ("time",)),
+    )
     fields = np.dtype([*_XYZI, ("tag", "u1"), ("line", "u1"), ("timestamp", "<f8")])
     compensated_fields = np.dtype(fields.descr[:-1])
     time_field = "timestamp"
@@ -326,7 +357,7 @@ class MessageLayout:
 
     def row(self, columns: set[str]) -> np.dtype[np.void]:
         """Return the type of a point, given the names of the columns in the cloud."""
-        extra = [name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= columns]
+        extra = [name for name, (_, needs) in EXTRA_FIELDS.items() if {*needs} <= columns]
         return self.layout.row(extra, compensated=self.compensated)
 
 
@@ -403,10 +434,10 @@ def _return_types(columns: Mapping[str, AnyArray], mode: str) -> AnyArray:
     count = len(number)
     if mode in _SINGLE_RETURN_TYPES:
         return np.full(count, _SINGLE_RETURN_TYPES[mode])
-    types = np.full(count, UNKNOWN)
+    types = np.full(count, UNKNOWN)  # also if the number of returns is 0, which means unknown
     types[number == 2] = SECOND
     types[number == 1] = FIRST
-    types[number == returns] = LAST
+    types[(number == returns) & (returns > 0)] = LAST
     types[returns == 1] = IDENTICAL
     if mode not in TWO_RETURNS or count < 2:
         return types
