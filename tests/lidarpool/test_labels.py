@@ -17,6 +17,7 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city as city_scene
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim.sweeps.sweeps import Sweeps
 
 PAGE = (Path(__file__).parents[2] / "docs/how-to/labels.md").read_text("utf-8")
 

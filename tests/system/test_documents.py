@@ -663,7 +663,7 @@ def tables_of(page: str, head: str) -> list[list[str]]:
 
 
 def test_tables_of_formats_are_those_of_the_code():
-    of_clouds, of_fields, with_boxes = tables_of("docs/how-to/formats.md", "format")
+    of_clouds, _, of_fields, with_boxes = tables_of("docs/how-to/formats.md", "format")
     assert sorted(of_clouds) == sorted(EXPORTS)
     assert {"ply", *EXPORTS, *LAYOUTS} <= {*of_fields}
     assert {*with_boxes} < {*EXPORTS}

@@ -55,7 +55,10 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert {"intensity", "time", "range", "class", "reflectivity"} <= set(cloud.columns)
     assert "survey's sweeps" in cloud.sweeps.__doc__
     assert [*cloud.sweeps().sensors] == ["front", "rear"]
-    np.testing.assert_allclose(laspy.read(out / "cloud.laz").xyz, cloud.positions, atol=1e-5)
+    laz = laspy.read(out / "cloud.laz")
+    np.testing.assert_allclose(laz.xyz, cloud.positions, atol=1e-5)
+    np.testing.assert_allclose(laz.gps_time, cloud.time / 1e9)
+    np.testing.assert_array_equal(laz.return_number, cloud.return_number)
     assert len(list((out / "kitti/sequences/01/velodyne").iterdir())) == 3  # turns of 0.1 s
 
     before = laspy.read(out / "cloud.laz")
@@ -63,19 +66,18 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     stored = np.minimum(before["energy"] / full_scale, 1) * 65_535
     np.testing.assert_allclose(before.intensity, stored, atol=0.51)
     assert np.quantile(before.intensity, 0.99) > 32_767, "the scale is no larger than needed"
-    refused = lidarpool(
-        "export", out, "-f", "mcap", "--layout", "autoware", "--out", tmp_path / "no"
-    )
+    refused = lidarpool("export", out, "-f", "mcap", "--layout", "images", "--out", tmp_path / "no")
     assert (
         refused.code == 2
-        and "layout autoware requires the columns return_number and returns" in refused.err
-        and "with `output: {write: [{format: mcap, layout: autoware}]}`, or add" in refused.err
+        and "layout images requires the column ray, which" in refused.err
+        and "with `output: {write: [{format: mcap, layout: images}]}`, or add" in refused.err
     )
     assert not (tmp_path / "no").exists()
     mixed = ("export", out, "-f", "pcd", "-f", "kitti", "--compensated", "--out", tmp_path / "mix")
     mixed = lidarpool(*mixed)
     assert mixed.code == 0 and "note: PCD cannot store time" in mixed.err
-    assert "note: KITTI cannot store channel, time, range\n" in mixed.err
+    columns = "channel, time, range, return_number, returns"
+    assert f"note: KITTI cannot store {columns}\n" in mixed.err
     assert b"start of the sweep" in (tmp_path / "mix/pcd/000000.pcd").read_bytes()[:100]
     scaled = ("export", out, "-f", "pcd", "-f", "las", "--intensity-full-scale", "100")
     assert lidarpool(*scaled, "--out", tmp_path / "scaled").code == 0
@@ -103,7 +105,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
 
     # What the earlier run left would pass for this one's; an export is in no report, and stays.
     (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, ", ""))
-    assert lidarpool(*run, "-q").code == 0
+    assert lidarpool(*run, "-q", "--overwrite").code == 0
     assert {path.name for path in out.iterdir()} == (made | {"pcd"}) - {"cloud.laz"}
 
 

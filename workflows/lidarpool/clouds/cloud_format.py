@@ -127,17 +127,11 @@ class CloudFormat(ABC):
     @classmethod
     def required_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
         """Return the columns that a cloud must have."""
-        required = ("scan",) if cls.by_sweep else ()
-        required += cls.required
-        required += tuple(
-            name
-            for point_field in cls.fields_for(spec)
-            if point_field.is_required
-            for name in point_field.columns
-        )
-        if spec.compensated_actors:
-            required += ("time",)
-        return tuple(dict.fromkeys(required))
+        fields = [field for field in cls.fields_for(spec) if field.is_required]
+        required = [*cls.required, *(name for field in fields for name in field.columns)]
+        scan = ["scan"] if cls.by_sweep else []
+        time = ["time"] if spec.compensated_actors else []
+        return tuple(dict.fromkeys([*scan, *required, *time]))
 
     @classmethod
     def stored_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> set[str] | None:
@@ -146,9 +140,9 @@ class CloudFormat(ABC):
             return None
         return {
             name
-            for point_field in cls.fields_for(spec)
-            if sweeps.classes or not point_field.if_named
-            for name in point_field.columns
+            for field in cls.fields_for(spec)
+            if sweeps.classes or not field.if_named
+            for name in field.columns
         }
 
     @classmethod

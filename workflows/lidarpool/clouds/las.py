@@ -101,8 +101,9 @@ class LAS(CloudFormat):
       classes, which are truncated to 15 ASCII characters.
 
     All columns except return numbers, numbers of returns and colors are also stored in the extra
-    bytes, without these limits. Fields whose values are unknown are 0. The coordinate system is stored as WKT, the names of materials as
-    JSON in a record of lidarpool, and the frame of the points in a text area record.
+    bytes, without these limits. Fields whose values are unknown are 0. The coordinate system is
+    stored as WKT, the names of materials as JSON in a record of lidarpool, and the frame of the
+    points in a text area record.
     """
 
     title = "LAS"

@@ -259,7 +259,7 @@ class OusterLayout(_CountedNanoseconds):
 class _Reflectivities(PointLayout):
     """Base class for layouts with absolute times, whose intensity is the reflectivity."""
 
-    point_fields = (
+    point_fields: ClassVar[tuple[PointField, ...]] = (
         PointField("intensity", ("reflectivity",)),
         PointField("ring", ("channel",)),
         PointField("timestamp", ("time",)),
