@@ -52,7 +52,8 @@ def test_a_sensor_is_planar_if_a_beam_turns_in_a_plane_about_its_center(sensor, 
         names = [column.name for column in complete.stored_columns]
         assert ({"ray", "range"} <= {*names}) is added
     thinned = replace(survey, keep_every=2)
-    assert with_format_columns(thinned, [ExportSpec("mcap")]) == thinned
+    names = {column.name for column in with_format_columns(thinned, [ExportSpec("mcap")]).columns}
+    assert names == {"intensity", "time"}
 
 
 @pytest.mark.parametrize("light", ["intensity", "signal", None])

@@ -135,4 +135,4 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     ):
         with pytest.raises(LidarError, match=says):
             prepare(scenario_of(output=write, **sections))
-    assert with_format_columns(survey, [ExportSpec("laz")]) is survey
+    assert with_format_columns(survey, [ExportSpec("parquet")]) is survey
