@@ -267,6 +267,35 @@ def test_units_are_those_of_the_project(forked, tmp_path, schema, prefix, unit_m
     assert ["does not specify a length unit" in note for note in notes] == [True] * (prefix == "")
 
 
+@pytest.mark.parametrize(
+    ("east", "north", "is_placed"),
+    [(691_000, 5_336_000, True), (690_100, 5_337_500, True), (0, 0, False), (691_000, 0, False)],
+)
+@pytest.mark.parametrize(("unit", "unit_m"), [("METRE", 1.0), (None, 0.001)])
+def test_a_map_conversion_of_a_placed_building_is_not_advised(
+    forked, tmp_path, east, north, is_placed, unit, unit_m
+):
+    model = Model(prefix="MILLI")
+    model.element("IfcWall", "W", at=(1000 * east, 1000 * north, 500_000))
+    create = model.file.create_entity
+    stated = unit and create("IfcSIUnit", UnitType="LENGTHUNIT", Name=unit)
+    create(
+        "IfcMapConversion",
+        SourceCRS=model.context,
+        TargetCRS=create("IfcProjectedCRS", Name="EPSG:25832", MapUnit=stated),
+        Eastings=691_000.0 / unit_m,
+        Northings=5_336_000.0 / unit_m,
+        OrthogonalHeight=500.0 / unit_m,
+        Scale=0.001 if unit else None,
+    )
+    notes = []
+    load_meshes(model.write(tmp_path / "a.ifc"), report=notes.append)
+    (note,) = notes
+    assert ("is already in EPSG:25832" in note) == is_placed
+    assert ("use translation [691000, 5336000, 500]" in note) != is_placed
+    assert ("must not be applied again" in note) == is_placed
+
+
 def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
     model = Model(prefix="MILLI")
     model.element("IfcWall", "W")

@@ -580,6 +580,16 @@ def test_notes_on_coordinate_systems(tmp_path, header, note):
     assert note in notes[0]
 
 
+def test_an_offset_that_the_roads_contain_is_not_advised(tmp_path):
+    offset = '<offset x="691000" y="5336000" z="0" hdg="0"/>'
+    header = f'<header revMajor="1"><geoReference>EPSG:25832</geoReference>{offset}</header>'
+    notes = []
+    load(tmp_path, document(road(at=(691_200, 5_335_500, 0)), header=header), notes)
+    (note,) = notes
+    assert "is already in EPSG:25832" in note
+    assert "translation" not in note
+
+
 @pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 @pytest.mark.parametrize("system", ["EPSG:3857", "+proj=merc +a=6378137 +b=6378137"])
 def test_stretched_meters_are_noted_with_the_scale_that_helps(tmp_path, system):

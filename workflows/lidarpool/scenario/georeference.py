@@ -8,14 +8,14 @@ import numpy as np
 
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats
-from lidarsim.scene.files.coordinate_systems import outside_system, target_problem, zone_in_area
+from lidarsim.scene.files.coordinate_systems import (
+    includes_offset,
+    outside_system,
+    target_problem,
+    zone_in_area,
+)
 from lidarsim.scene.scene import Scene
 
-# `world.origin` was probably added to world coordinates if it is at least `_FAR_M` from zero, and
-# if its distance from the coordinates in the files is less than `_SAME_SHARE` of that. Local
-# coordinates are close to zero.
-_FAR_M = 50_000.0
-_SAME_SHARE = 0.2
 _PROJECTED_M = 100_000.0  # coordinates this far from zero are probably projected
 
 
@@ -91,11 +91,7 @@ def _center(scene: Scene) -> Floats:
 def _is_added_twice(scene: Scene) -> bool:
     """Return whether the coordinates in the files probably include `world.origin` already."""
     origin = scene.world_origin[:2]
-    in_files = _center(scene) - origin
-    distance_m = float(np.linalg.norm(origin))
-    return distance_m > _FAR_M and bool(
-        np.linalg.norm(in_files - origin) < _SAME_SHARE * distance_m
-    )
+    return includes_offset(_center(scene) - origin, origin)
 
 
 def _remedies(epsg: int, scene: Scene) -> str:

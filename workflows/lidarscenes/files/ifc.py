@@ -25,7 +25,12 @@ from lidarsim.io.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.elementary import arctan2
 from lidarsim.scene.colors import Colors, as_bytes
-from lidarsim.scene.files.coordinate_systems import center_of, scale_problem, world_advice
+from lidarsim.scene.files.coordinate_systems import (
+    center_of,
+    includes_offset,
+    scale_problem,
+    world_advice,
+)
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
     Content,
@@ -282,6 +287,13 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
         return [f"contains a map conversion that cannot be used because {error}"]
     epsg = re.search(r"(?i)\bepsg:{1,2}(\d{4,6})\b", conversion.system)
     system = f"EPSG:{epsg[1]}" if epsg else repr(conversion.system)
+    offset_m = np.array(conversion.offset[:2]) * conversion.unit_m
+    if includes_offset(middle, offset_m):
+        where = system if conversion.system else "its coordinate system"
+        return [
+            f"is already in {where}. It also contains a map conversion with the same offset, which "
+            "must not be applied again"
+        ]
     if conversion.is_identity:
         if problem := scale_problem(system, *middle.tolist()) if epsg else "":
             return [f"uses {system}, {problem}"]

@@ -19,7 +19,12 @@ from lidarsim.io.allowance import Allowance
 from lidarsim.io.xmlfile import xml_root
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import Colors
-from lidarsim.scene.files.coordinate_systems import center_of, scale_problem, world_advice
+from lidarsim.scene.files.coordinate_systems import (
+    center_of,
+    includes_offset,
+    scale_problem,
+    world_advice,
+)
 from lidarsim.scene.files.scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -209,10 +214,19 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
     if offset is not None:
         shift = [read_number(offset, name, 0.0) for name in ("x", "y", "z", "hdg")]
     system = f"EPSG:{epsg}" if epsg else f"the coordinate system {text[:80]!r}"
-    place = middle + shift[:2]  # approximate if a heading rotates the roads about their origin
+    is_placed = includes_offset(middle, np.array(shift[:2]))
+    place = (
+        middle if is_placed else middle + shift[:2]
+    )  # approximate if a heading rotates the roads about their origin
     problem = scale_problem(f"EPSG:{epsg}" if epsg else text, *place.tolist()) if text else ""
     if problem:
         system += f", {problem}"
+    if is_placed:
+        where = system if text else "its coordinate system"
+        return [
+            f"is already in {where}. It also contains the same offset, which must not be applied "
+            "again"
+        ]
     if any(shift):
         x, y, z, heading = shift
         moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]

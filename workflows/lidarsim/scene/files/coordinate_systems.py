@@ -34,6 +34,10 @@ _UTM_HALF_WIDTH_M = 900_000.0  # at this distance from it, the length error is 0
 _GROUND_STEP_M = 10.0  # step of the finite differences from which scales are computed
 _BLOCK_POINTS = 100_000  # points transformed at a time, since rasterio uses Python lists
 ELLIPSOID = "ellipsoid"  # vertical datum of ellipsoidal heights
+# Coordinates probably include an offset if the offset is at least `_FAR_M` long, and if its
+# distance from the coordinates is less than `_SAME_SHARE` of that.
+_FAR_M = 50_000.0
+_SAME_SHARE = 0.2
 UNNAMED = ("unnamed", "unknown", "")  # names that GDAL and PROJ use for systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, north and south
 _POLAR_DEG = 84.0  # from this latitude on, universal polar stereographic replaces UTM
@@ -589,6 +593,15 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
         factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
         clause += f" (scale [{factor}, {factor}, 1] corrects the lengths)"
     return clause
+
+
+def includes_offset(place: Floats, offset: Floats) -> bool:
+    """Return whether horizontal coordinates probably include a map offset already.
+
+    `place` (2,) and `offset` (2,) are in meters. Local coordinates are close to zero.
+    """
+    distance_m = float(np.hypot(*offset))
+    return distance_m > _FAR_M and float(np.hypot(*(place - offset))) < _SAME_SHARE * distance_m
 
 
 def world_advice(x: float, y: float, z: float) -> str:
