@@ -15,7 +15,16 @@ import trimesh
 from click.testing import CliRunner
 from rasterio.crs import CRS
 
-from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare_strips, compare_surveys
+from lidarpool import (
+    Cloud,
+    LidarError,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    compare_strips,
+    compare_surveys,
+)
 from lidarpool.cli.commands import cli
 from lidarpool.comparing.surveys import pairs
 from lidarsim.sweeps.sweeps import Sweeps
@@ -158,6 +167,48 @@ def test_times_of_any_size_identify_points(times):
     one = components(compare_surveys(a, cloud(points, gps_time=times), method="pairs"), "delta_n")
     assert one["count"] == 900
     assert one["mean_m"] == pytest.approx(SHIFT[1], abs=1e-8) and one["std_m"] < 1e-8
+
+
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_ranges_of_a_moving_sensor_start_where_each_ray_is_fired(monkeypatch, coordinates):
+    # 60 sweeps of one scan line each. The platform moves by 2 m during a sweep.
+    track = Track([0, 7], [[0, 0, 30], [140, 35, 37]])
+    survey = Survey(Sensor.grid(360, 1), trajectory=track, steps=60 * 36)
+    sweeps = replace(Sweeps.from_survey(survey, Scene.seed()), coordinates=coordinates)
+    time = np.arange(60 * 18) * 5_555_555
+    columns = {"scan": np.arange(60 * 18) * 2, "channel": 0 * time, "object": 0 * time}
+    rng = np.random.default_rng(21)
+    rays = rng.normal((0, 0, -3), size=(len(time), 3))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    ranges = rng.uniform(20, 40, len(time))
+    starts = np.array([0, 0, 30]) + time[:, None] / 1e9 * np.array([20, 5, 1])
+    read = []
+
+    def counted(cloud, *arguments, chunks=Cloud.chunks):
+        for chunk in chunks(cloud, *arguments):
+            read.append(len(chunk))
+            yield chunk
+
+    monkeypatch.setattr(Cloud, "chunks", counted)
+    a, b = (
+        Cloud(
+            (ranges + longer)[:, None] * rays @ turned + starts * (coordinates == "world"),
+            {**columns, "time": time},
+            sweeps=lambda: sweeps,
+        )
+        for longer in (0.03, 0.0)
+        for turned in [sweeps.pose.rotations[0] if coordinates == "sensor" else np.eye(3)]
+    )
+    shown = []
+    found = compare_surveys(a, b, method="pairs", on_progress=lambda *row: shown.append(row))
+    delta_h, lengths = components(found, "delta_h", "range")
+    assert lengths["count"] == len(time)
+    assert lengths["mean_m"] == pytest.approx(0.03, abs=1e-6) and lengths["std_m"] < 1e-5
+    assert delta_h["mean_m"] == pytest.approx(0.03 * rays[:, 2].mean(), abs=1e-5)
+    apart = np.linalg.norm(found.points[:, None] - (starts + ranges[:, None] * rays), axis=2)
+    assert apart.min(axis=0).max() < 1e-4 and apart.min(axis=1).max() < 1e-4
+    assert shown[-1] == ("reading cloud B", 60, 60, "sweeps")
+    assert sum(read) < 3 * 2 * len(time), "no sweep is searched for in a larger chunk"
 
 
 def test_points_without_a_time_are_counted():

@@ -13,6 +13,7 @@ from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import join_names
 
 from . import shared_options as options
+from .terminal import Terminal
 
 if TYPE_CHECKING:
     from ..comparing.comparison import Comparison
@@ -27,6 +28,7 @@ _SWEEP_OPTIONS = (
 _CLOUD_OPTIONS = ("sensor_a", "sensor_b", "unit_a", "unit_b", "max_points")
 _SURVEY_OPTIONS = ("up_axis", "radius_m", "max_distance_m")
 _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
+_SHARED = ("keep_noise", "on_progress")
 
 
 @click.command()
@@ -188,7 +190,8 @@ def compare(
         _reject_options(context, _SWEEP_OPTIONS, "cannot be used with `--survey`")
         _reject_options(context, _STRIP_OPTIONS, "requires `--survey strips`")
     keep_freed_memory()
-    comparison = _compared(survey, a, others, settings)
+    with Terminal(as_json=as_json).writing("comparing the clouds", logged=False) as show:
+        comparison = _compared(survey, a, others, settings | {"on_progress": show})
     page = next(path for path in comparison.save(out) if path.suffix == ".html")
     label = f"{'page':<{9 if survey is None else 10}}"
     lines = [repr(comparison), f"{label}{click.format_filename(page)}"]
@@ -206,13 +209,13 @@ def _compared(
     if survey is None:
         from ..comparing.two_clouds import compare as compare_clouds
 
-        kept = chosen(*_SWEEP_OPTIONS, *_CLOUD_OPTIONS, "keep_noise")
+        kept = chosen(*_SWEEP_OPTIONS, *_CLOUD_OPTIONS, *_SHARED)
         return compare_clouds(a, others[0], **kept)
     from ..comparing.surveys import compare_strips, compare_surveys
 
     if survey == STRIPS:
-        return compare_strips(a, *others, **chosen(*_STRIP_OPTIONS, "keep_noise"))
-    kept = chosen(*_CLOUD_OPTIONS, *_SURVEY_OPTIONS, "keep_noise")
+        return compare_strips(a, *others, **chosen(*_STRIP_OPTIONS, *_SHARED))
+    kept = chosen(*_CLOUD_OPTIONS, *_SURVEY_OPTIONS, *_SHARED)
     return compare_surveys(a, others[0], method=survey, **kept)
 
 

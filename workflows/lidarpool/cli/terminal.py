@@ -81,17 +81,18 @@ class Terminal(Screen):
             yield
 
     @contextmanager
-    def writing(self, words: str) -> Iterator[WritingProgress]:
-        """Show a progress bar for each file that is written in the body.
+    def writing(self, words: str, *, logged: bool = True) -> Iterator[WritingProgress]:
+        """Show a progress bar for each file that is written, or each activity, in the body.
 
-        Outside a terminal, `words` and occasional progress lines are printed.
+        Outside a terminal, occasional progress lines are printed, preceded by `words` if `logged`
+        is True.
         """
         console = self.console
         if console is not None:
             with progress_rows(console) as show:
                 yield show
         else:
-            with self.status(words):
+            with self.status(words, logged=logged):
                 yield WrittenLines(self._stream) if self._stream else lambda *_: None
 
     @contextmanager

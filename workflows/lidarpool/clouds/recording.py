@@ -640,13 +640,14 @@ def open_cloud(
     def read_fired(number: int) -> Sweep:
         index = indices[number]
         points = next(saved.points(cloud, index, index + 1))
+        poses = saved.firing_poses(index, points)
         return Sweep(
-            saved.as_fired(index, points),
+            saved.as_fired(index, points, poses),
             points.columns,
             pose=saved.pose.matrix(index),
             time_ns=float(saved.begins_ns[index]),
             compensated=False,
-            firing_poses=saved.firing_poses(index, points),
+            firing_poses=poses,
         )
 
     def read_poses() -> Floats:

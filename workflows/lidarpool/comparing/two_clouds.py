@@ -16,6 +16,7 @@ from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
+from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.checks import check_choice, check_number
@@ -53,6 +54,7 @@ def compare(
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     max_points: int = MAX_POINTS,
     protocol: Literal["lidar4d"] | None = None,
+    on_progress: WritingProgress = lambda *_: None,
 ) -> Comparison:
     """Compare two clouds or recordings of the same scene.
 
@@ -95,6 +97,9 @@ def compare(
     protocol
         Published evaluation protocol whose metrics are also computed: "lidar4d" for the range
         images and metrics of LiDAR4D. The sweeps of B are the recorded ones.
+    on_progress
+        Function that is called with the name of an activity, the number of completed items, the
+        total number of items, and their unit, such as ("comparing", 7, 80, "sweeps").
 
     Returns
     -------
@@ -135,7 +140,8 @@ def compare(
                 _motion_note(*sorted((first, second), key=lambda r: not r.compensated))
             )
         budget = MAX_VALUES // len(pairs)
-        for number_a, number_b in pairs:
+        for done, (number_a, number_b) in enumerate(pairs, 1):
+            on_progress("comparing", done, len(pairs), "sweeps")
             sweep_a, sweep_b = (
                 compared_sweep(recording, number, with_rays=comparing.has_same_rays)
                 for recording, number in ((first, number_a), (second, number_b))

@@ -144,11 +144,7 @@ def _stored_sweeps(folder: Path, source: Path | Storage) -> PlaybackSource:
     cloud = CloudFile(folder / CLOUD)
 
     def read(sweep: int) -> Cloud:
-        first, stop = (cloud.row_of(scan) for scan in sweeps.scans[sweep : sweep + 2].tolist())
-        if stop <= first:  # The scans may not be sorted.
-            return next(sweeps.points(cloud, sweep, sweep + 1))
-        points = next(cloud.chunks(stop - first, first))
-        return next(sweeps.points(points, sweep, sweep + 1))
+        return next(sweeps.points(cloud, sweep, sweep + 1))
 
     return PlaybackSource(sweeps, read, lambda: PictureContent.load_from(folder))
 

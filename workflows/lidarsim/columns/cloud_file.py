@@ -72,7 +72,7 @@ class CloudFile:
 
         The points must be ordered by scan.
         """
-        return bisect_left(self._rows["scan"], scan)
+        return bisect_left(self._rows["scan"].view(np.ndarray), scan)
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
         """Return the start and stop rows of an inclusive range of scans.

@@ -284,12 +284,15 @@ class Sweeps:
         """Return the next sweep, or the last sweep if there is none, in which case flow is NaN."""
         return min(sweep + 1, len(self) - 1)
 
-    def as_fired(self, sweep: int, points: Cloud) -> Floats:
-        """Return the points of a sweep in the sensor frame at the firing time of each point."""
+    def as_fired(self, sweep: int, points: Cloud, poses: FiringPoses | None = None) -> Floats:
+        """Return the points of a sweep in the sensor frame at the firing time of each point.
+
+        `poses` are the firing poses of the points, if they are already known.
+        """
         exact = points.positions.astype(np.float64)
         if self.coordinates == "sensor":
             return exact
-        return self.firing_poses(sweep, points).to_body_frame(exact)
+        return (poses or self.firing_poses(sweep, points)).to_body_frame(exact)
 
     def compensate_motion(self, sweep: int, points: Cloud) -> Floats:
         """Return the points of a sweep in the sensor frame at the start of the sweep.
@@ -661,9 +664,18 @@ class Sweeps:
     def _points(self, cloud: CloudLike, first: int, stop: int) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` up to `stop` at their stored positions."""
         sweep_parts: list[Cloud] = []
-        empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
+
+        def joined() -> Cloud:
+            if sweep_parts:
+                return Cloud.concatenate(sweep_parts)
+            return Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
+
         current = first
-        for chunk in cloud.chunks(_PIECE, cloud.row_of(int(self.scans[first])) if first else 0):
+        start_row, piece = 0, _PIECE
+        if first or stop < len(self):  # read no more than these sweeps
+            start_row, stop_row = map(cloud.row_of, self.scans[[first, stop]].tolist())
+            piece = min(_PIECE, max(stop_row - start_row, 1))
+        for chunk in cloud.chunks(piece, start_row):
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
                 raise LidarError(MIXED_UP)
@@ -671,14 +683,15 @@ class Sweeps:
             starts = np.flatnonzero(np.diff(sweep[:end], prepend=-1))
             for start, stop_row in pairwise([*starts, end]):
                 while current < sweep[start]:
-                    yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
+                    yield joined()
                     sweep_parts = []
                     current = current + 1
-                sweep_parts.append(chunk[start:stop_row])
+                is_whole = stop_row - start == len(chunk)
+                sweep_parts.append(chunk if is_whole else chunk[start:stop_row])
             if end < len(sweep):
                 break
         while current < stop:
-            yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
+            yield joined()
             sweep_parts = []
             current = current + 1
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from lidarsim._version import __version__
 from lidarsim.errors import LidarError
+from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.words import join_names
 
@@ -46,6 +47,7 @@ def compare_surveys(
     radius_m: float | None = None,
     max_distance_m: float | None = None,
     max_points: int = MAX_POINTS,
+    on_progress: WritingProgress = lambda *_: None,
 ) -> SurveyComparison:
     """Compare two survey clouds, or a cloud and a mesh, in world coordinates.
 
@@ -80,6 +82,9 @@ def compare_surveys(
         counterpart.
     max_points
         Maximum number of points of each cloud in memory. Larger clouds are sampled.
+    on_progress
+        Function that is called with the name of an activity, the number of completed items, the
+        total number of items, and their unit, such as ("reading flown", 7, 80, "sweeps").
 
     Returns
     -------
@@ -113,13 +118,14 @@ def compare_surveys(
     if method == "auto" and b_is_mesh:
         method = "mesh"
     given = {"radius_m": radius_m, "max_distance_m": max_distance_m, "up_axis": up_axis}
-    first = SurveyCloud.open(a, "cloud A", sensor=sensor_a, unit=unit_a, keep_noise=keep_noise)
+    common: dict[str, Any] = {"keep_noise": keep_noise, "show": on_progress}
+    first = SurveyCloud.open(a, "cloud A", sensor=sensor_a, unit=unit_a, **common)
     if method == "mesh":
         _check_options(method, given | {"sensor_b": sensor_b}, {"sensor_b": ()})
         assert isinstance(b, str | Path)
         reach_m = max_distance_m or MAX_DISTANCE_M
         return _compare_with_mesh(first, Path(b), reach_m, unit=unit_b, up_axis=up_axis)
-    second = SurveyCloud.open(b, "cloud B", sensor=sensor_b, unit=unit_b, keep_noise=keep_noise)
+    second = SurveyCloud.open(b, "cloud B", sensor=sensor_b, unit=unit_b, **common)
     notes = check_same_frame([first, second])
     if method in {"auto", "pairs"}:
         try:
@@ -145,6 +151,7 @@ def compare_strips(
     cell_m: float = 1.0,
     max_roughness_m: float = 0.1,
     keep_noise: bool = False,
+    on_progress: WritingProgress = lambda *_: None,
 ) -> SurveyComparison:
     """Compare the heights of overlapping strips.
 
@@ -164,6 +171,8 @@ def compare_strips(
         a higher value, such as those with vegetation or edges, are not compared.
     keep_noise
         Whether to include points that are withheld or classified as noise.
+    on_progress
+        Function that is called with the progress, as by `compare_surveys`.
 
     Returns
     -------
@@ -179,7 +188,7 @@ def compare_strips(
     check_number("cell_m", cell_m, gt=0)
     check_number("max_roughness_m", max_roughness_m, gt=0)
     opened = [
-        SurveyCloud.open(cloud, f"cloud {number}", keep_noise=keep_noise)
+        SurveyCloud.open(cloud, f"cloud {number}", keep_noise=keep_noise, show=on_progress)
         for number, cloud in enumerate(clouds, 1)
     ]
     if not opened:

@@ -110,7 +110,7 @@ def _find_key(a: SurveyCloud, b: SurveyCloud) -> PairKey:
 
     Raises UnpairedError if there are none.
     """
-    first, second = next(a.parts(), None), next(b.parts(), None)
+    first, second = (next(cloud.parts(with_ranges=True), None) for cloud in (a, b))
     key = None
     if first is not None and second is not None:
         key = PairKey.shared_by(first.columns, second.columns)
@@ -239,18 +239,19 @@ class _Sampled(NamedTuple):
         """Read a cloud, and reduce the limit until at most `max_points` points remain."""
         limit = _BITS
         kept: list[_KeyedPoints] = []
-        point_count = 0
-        key_count = 0
+        kept_count = point_count = key_count = 0
         limits = np.inf, -np.inf
-        for part in cloud.parts():
+        for part in cloud.parts(with_ranges=True):
             keyed = key.of(part)
             kept.append(_below(keyed, limit))
+            kept_count += len(kept[-1].keys)
             point_count += len(part)
             key_count += len(keyed.keys)
             limits = key.extend_limits(limits, part)
-            while sum(len(keyed.keys) for keyed in kept) > max_points:
+            while kept_count > max_points:
                 limit //= 2
                 kept = [_below(keyed, limit) for keyed in kept]
+                kept_count = sum(len(keyed.keys) for keyed in kept)
         ranges = [keyed.ranges for keyed in kept if keyed.ranges is not None]
         joined = _KeyedPoints(
             np.concatenate([np.zeros(0, np.uint64), *(keyed.keys for keyed in kept)]),

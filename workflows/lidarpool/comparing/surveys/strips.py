@@ -145,6 +145,7 @@ class _Grid:
         self.origin: Floats = np.zeros(3)  # lower corner of the cell of the first point
         self.strips = _Strips()
         self.pending: list[_CellSums] = []
+        self._pending_rows = 0  # rows that were added since the last merge
         self.point_count = 0
         self.single_count = 0
 
@@ -160,8 +161,10 @@ class _Grid:
         numbers = self.strips.number_points(file, part.columns[SENSOR][single], sources[single])
         sums = _cell_sums(part.points[single] - self.origin, numbers, self.cell_m)
         self.pending.append(sums)
-        if sum(len(cells.keys) for cells in self.pending) > _PENDING_ROWS:
+        self._pending_rows += len(sums.keys)
+        if self._pending_rows > _PENDING_ROWS:
             self.pending = [_merge_sums(self.pending)]
+            self._pending_rows = 0
 
 
 def _single_returns(part: Sweep) -> Indices:

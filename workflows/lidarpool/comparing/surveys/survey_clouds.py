@@ -12,6 +12,7 @@ import numpy as np
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
+from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
@@ -67,6 +68,7 @@ class SurveyCloud:
     name: str
     recordings: tuple[Recording, ...]  # one per sensor
     unit: str | None  # unit that the user chose
+    show: WritingProgress = lambda *_: None  # called when a part has been read
 
     @classmethod
     def open(
@@ -77,6 +79,7 @@ class SurveyCloud:
         sensor: str | None = None,
         unit: str | None = None,
         keep_noise: bool = False,
+        show: WritingProgress = lambda *_: None,
     ) -> SurveyCloud:
         """Open a cloud, with all of its sensors unless one is chosen.
 
@@ -95,7 +98,7 @@ class SurveyCloud:
             recordings = [opened(chosen) for chosen in error.names]
             if len({recording.sequence for recording in recordings}) > 1:
                 raise
-        return cls(recordings[0].name, tuple(recordings), unit)
+        return cls(recordings[0].name, tuple(recordings), unit, show)
 
     @property
     def notes(self) -> list[str]:
@@ -138,17 +141,22 @@ class SurveyCloud:
         names = (name for name, unit_m in UNITS_M.items() if abs(unit_m / meters - 1) < _MILLIONTH)
         return next(names, f"units of {meters:.10g} m")
 
-    def parts(self) -> Iterator[Sweep]:
+    def parts(self, *, with_ranges: bool = False) -> Iterator[Sweep]:
         """Yield all points in world coordinates, in parts of limited size.
 
-        The column `SENSOR` contains the index of the sensor. If the distances from the sensor are
-        known, the column `range` contains them.
+        The column `SENSOR` contains the index of the sensor. If `with_ranges` is true and the
+        distances from the sensor are known, the column `range` contains them.
 
         Raises LidarError if the cloud cannot be read, or if a pose is unknown.
         """
+        total = sum(recording.count for recording in self.recordings)
+        unit = "parts" if self.recordings[0].is_cloud else "sweeps"
+        done = 0
         for number, recording in enumerate(self.recordings):
             for index in range(recording.count):
-                part = _world_points(recording, index)
+                done += 1
+                self.show(f"reading {self.name}", done, total, unit)
+                part = _world_points(recording, index, with_ranges=with_ranges)
                 if len(part):
                     sensor = np.full(len(part), number, np.int64)
                     yield part.replace(columns={**part.columns, SENSOR: sensor})
@@ -190,9 +198,12 @@ class SurveyCloud:
         return points, [] if share == 1 else [note]
 
 
-def _world_points(recording: Recording, number: int) -> Sweep:
+def _world_points(recording: Recording, number: int, *, with_ranges: bool) -> Sweep:
     """Return the returns of a sweep in world coordinates, with the position of its scanner."""
-    sweep = recording[number].returns()
+    # Points as fired are at their ranges from the sensor. They are read only if required, because
+    # they are transformed with a pose each.
+    as_fired = recording.fired is not None and (with_ranges or recording.compensated is False)
+    sweep = recording.read_fired(number) if as_fired else recording[number].returns()
     check_reach(recording, sweep)
     scanner = sweep.scanner
     if scanner is not None:
@@ -207,11 +218,12 @@ def _world_points(recording: Recording, number: int) -> Sweep:
     # Files of scans without a pose are read with an identity matrix.
     if scanner is None and (recording.read_poses or not np.array_equal(sweep.pose, np.eye(4))):
         scanner = sweep.pose[:3, 3]
+    poses = sweep.firing_poses
     columns = sweep.columns
-    if "range" not in columns:
-        fired = sweep if recording.fired is None else recording.read_fired(number)
-        columns = {**columns, "range": np.linalg.norm(fired.points, axis=1)}
-    return sweep.replace(points=sweep.in_world(), columns=columns, scanner=scanner)
+    if with_ranges and "range" not in columns:
+        columns = {**columns, "range": np.linalg.norm(sweep.points, axis=1)}
+    points = sweep.in_world() if poses is None else poses.to_world(sweep.points)
+    return sweep.replace(points=points, columns=columns, scanner=scanner)
 
 
 def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
