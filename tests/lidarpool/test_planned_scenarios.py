@@ -85,7 +85,8 @@ def test_a_plan_keeps_all_sections_that_it_does_not_replace(site, command):
     kept = KEPT.keys() - dropped
     assert {name: content.get(name) for name in kept} == {name: expected[name] for name in kept}
     assert planned.cloud.keep_every == 3 and planned.cloud.start == given.cloud.start
-    new = {"flight": ("time", "range"), "stations": ("range",)}[command]
+    grid = ("ray",) if command == "stations" else ()
+    new = ("range", "return_number", "returns", "class", "time", *grid)
     assert planned.cloud.columns == ("intensity", *new)
     assert planned.mount is None
     used = {path.resolve() for path in planned.files} - {(folder / "path.csv").resolve()}
@@ -109,6 +110,7 @@ def test_a_plan_omits_the_replaced_platform_and_the_faults_of_its_sensors(site):
         faults=[{"kind": "dead_channels", "channels": [3]}],
     )
     assert [actor.name for actor in planned.actors] == ["Tree"]
+    assert planned.cloud.columns == ("range", "intensity", "return_number", "returns", "time")
     assert not planned.faults
     assert "The actor Car is omitted, because the plan replaces the platform" in output
     assert "`faults` is omitted, because the plan replaces the sensors" in output

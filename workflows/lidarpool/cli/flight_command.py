@@ -17,7 +17,13 @@ from lidarsim.words import format_rounded
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
-from .planned_scene import carried_sections, comment_lines, prepared_with_notes, sensor_entry
+from .planned_scene import (
+    carried_sections,
+    comment_lines,
+    planned_columns,
+    prepared_with_notes,
+    sensor_entry,
+)
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -34,7 +40,7 @@ PICTURE_FILE = "flight.png"
 GEOJSON_FILE = "flight.geojson"
 KML_FILE = "flight.kml"
 FILES = (SCENARIO_FILE, PATH_FILE, PICTURE_FILE, GEOJSON_FILE, KML_FILE)
-_COLUMNS = ["time", "range"]
+_FORMATS = ("laz",)  # formats to which the results of plans are exported
 _SHOWN_LINES = 20  # maximum number of lines listed individually
 _STEP_DEG = 360  # time step in degrees of the scanner's cycle, so one cycle per scan
 _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degrees
@@ -244,6 +250,7 @@ class _Site(NamedTuple):
     scenario: Scenario | None  # scenario with the terrain, or None for level ground
     epsg: int | None  # EPSG code of the scenario coordinates plus `origin`
     origin: Floats  # (3,), world origin of the scenario, meters
+    columns: list[str]  # columns of the planned survey
     notes: list[str]
 
 
@@ -280,7 +287,9 @@ def _read_site(
         if drawn.epsg is not None:
             origin[:2] = np.floor(np.array(shape.centroid.coords[0]) / _ORIGIN_M) * _ORIGIN_M
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
-        return _Site(_area_name(area), shape, Terrain(), None, epsg, origin, [])
+        return _Site(
+            _area_name(area), shape, Terrain(), None, epsg, origin, planned_columns(_FORMATS), []
+        )
     from ..scenario.scenario import Scenario
 
     scenario = Scenario.load(source, of_mesh)
@@ -302,7 +311,16 @@ def _read_site(
         if drawn.epsg is not None:
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
     name = source.stem if drawn is None else _area_name(area)
-    return _Site(name, shape, Terrain(scene), scenario, epsg, origin, notes)
+    return _Site(
+        name,
+        shape,
+        Terrain(scene),
+        scenario,
+        epsg,
+        origin,
+        planned_columns(_FORMATS, prepared.survey.materials),
+        notes,
+    )
 
 
 def _in_system(drawn: Any, epsg: int | None) -> Any:
@@ -408,10 +426,10 @@ def _site_sections(plan: FlightPlan, site: _Site, folder: Path) -> tuple[dict[st
         margin_m = max(math.ceil(reach_m * _GROUND_MARGIN), _MIN_MARGIN_M)
         sections: dict[str, Any] = {"scene": {"ground": {"height_m": 0, "margin_m": margin_m}}}
         sections |= {"world": {"origin": site.origin[:2].tolist()}} if site.origin.any() else {}
-        sections |= {"cloud": {"columns": _COLUMNS}}
+        sections |= {"cloud": {"columns": site.columns}}
         omissions: list[str] = []
     else:
-        sections, omissions = carried_sections(site.scenario, folder, _COLUMNS)
+        sections, omissions = carried_sections(site.scenario, folder, site.columns)
     if site.epsg is not None:
         sections["world"] = sections.get("world", {}) | {"epsg": site.epsg}
     sections["cloud"] = {"precision_m": 0.001} | sections["cloud"]

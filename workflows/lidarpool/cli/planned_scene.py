@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.schema.vocabulary import ALWAYS_COLUMNS
 from lidarsim.words import join_names
 
 if TYPE_CHECKING:
+    from lidarsim.media.materials import Material
+
     from ..scenario.prepare import PreparedScenario
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
@@ -69,6 +72,20 @@ def carried_sections(
     cloud = sections.get("cloud", {})
     sections["cloud"] = cloud | {"columns": [*dict.fromkeys([*cloud.get("columns", ()), *columns])]}
     return {name: value for name, value in sections.items() if value}, notes
+
+
+def planned_columns(formats: Sequence[str], materials: Iterable[Material] = ()) -> list[str]:
+    """Return the columns of a planned survey, so that its result can be exported to formats.
+
+    They are the range and the columns of all fields of the formats. The class is only included if a
+    material has a class.
+    """
+    from ..clouds.writing import ExportSpec
+
+    has_classes = any(material.semantic_class for material in materials)
+    names = dict.fromkeys(name for each in formats for name in ExportSpec(each).added)
+    unknown = set(ALWAYS_COLUMNS) | (set() if has_classes else {"class"})
+    return ["range", *(name for name in names if name not in unknown)]
 
 
 def sensor_entry(model: str, folder: Path) -> str:

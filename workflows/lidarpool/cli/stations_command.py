@@ -20,7 +20,13 @@ from lidarsim.words import join_names, plural, printable
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
-from .planned_scene import carried_sections, comment_lines, prepared_with_notes, sensor_entry
+from .planned_scene import (
+    carried_sections,
+    comment_lines,
+    planned_columns,
+    prepared_with_notes,
+    sensor_entry,
+)
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -33,6 +39,7 @@ if TYPE_CHECKING:
 
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
+_FORMATS = ("laz", "e57")  # formats to which the results of plans are exported
 _SHOWN_OBJECTS = 12  # maximum number of objects listed individually
 _DOMINANT_SHARE = 0.75  # an object with a larger share of the reachable area causes a note
 _MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a note
@@ -203,7 +210,8 @@ def _plan(
     prepared, notes = prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
         plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
-    sections, omissions = carried_sections(scenario, folder, ["range"])
+    columns = planned_columns(_FORMATS, prepared.survey.materials)
+    sections, omissions = carried_sections(scenario, folder, columns)
     if sections.pop("navigation", None):
         omissions.append("`navigation` is omitted, because the stations are separate poses")
     remarks = [f"Warning: {warning}" for warning in terminal.warnings]
