@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool.cli import doctor, installed_copies
-from lidarpool.identity.software import PACKAGES
+from lidarpool.identity.versions import PACKAGES
 from lidarsim.environment.extras import CHECKOUT, install_command
 from raybeam import installation
 

@@ -24,7 +24,8 @@ from hypothesis.extra import numpy as npst
 
 from lidarpool import Beams, LidarError, Sensor, Spin
 from lidarpool.identity.fingerprint import fingerprint
-from lidarpool.identity.software import PACKAGES, describe_difference, software, source_hash
+from lidarpool.identity.software import describe_difference
+from lidarpool.identity.versions import PACKAGES, software, source_hash
 from lidarsim.sensor import Head
 
 Pair = namedtuple("Pair", "a b")
@@ -216,7 +217,7 @@ def test_what_has_none_is_refused_by_name(thing, name):
             fingerprint(outer)
 
 
-ASK = "from lidarpool.identity.software import source_hash; print(source_hash())"
+ASK = "from lidarpool.identity.versions import source_hash; print(source_hash())"
 
 
 @pytest.fixture

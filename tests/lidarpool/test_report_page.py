@@ -37,7 +37,6 @@ from lidarpool.report.page.rendering import (
     MAX_ROWS,
     draw_top_view,
     insert_picture,
-    sentence,
     write_page,
 )
 from lidarpool.report.report import make_report
@@ -46,6 +45,7 @@ from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.planning_trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
+from lidarview.page_templates import sentence
 
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"

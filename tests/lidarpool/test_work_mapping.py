@@ -183,3 +183,27 @@ def test_a_map_on_this_machine_imports_no_dask():
     code = "import lidarpool.work.process_pool, sys; print('dask' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "augmentation.running",
+        "reconstruction.building",
+        "comparing.fit.fitting",
+        "occupancy.writing",
+        "mounting.study",
+        "recordings.opening",
+        "scenario.scenario",
+        "playback.player",
+        "following.node",
+        "serving.service",
+    ],
+)
+def test_what_needs_no_cluster_imports_neither_dask_nor_what_draws(module):
+    code = (
+        f"import sys, lidarpool.{module}; "
+        "print(*{'dask', 'distributed', 'tornado', 'matplotlib', 'jinja2'} & {*sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

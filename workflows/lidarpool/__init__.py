@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from .clouds.recording import Recording
     from .clouds.writing import save_cloud
     from .comparing.comparison import Comparison
-    from .comparing.fit import Fit, fit
+    from .comparing.fit.fitting import Fit, fit
     from .comparing.surveys import SurveyComparison, compare_strips, compare_surveys
     from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
@@ -153,7 +153,7 @@ _MODULES = {
     ".comparing.comparison": ("Comparison",),
     ".comparing.surveys": ("SurveyComparison", "compare_strips", "compare_surveys"),
     ".comparing.two_clouds": ("compare",),
-    ".comparing.fit": ("Fit", "fit"),
+    ".comparing.fit.fitting": ("Fit", "fit"),
     ".scan_patterns": ("PatternFit", "fit_pattern"),
     ".reconstruction.building": ("twin",),
     ".reconstruction.twin": ("Twin",),

@@ -23,7 +23,7 @@ from ..clouds.folder import result_folder
 from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
-from ..identity.software import software
+from ..identity.versions import software
 from ..work.mapping import MapFunction, parallel_map
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (

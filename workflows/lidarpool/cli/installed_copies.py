@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 
 from lidarsim.environment.extras import install_command
 
-from ..identity.software import PACKAGES
+from ..identity.versions import PACKAGES
 
 _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 

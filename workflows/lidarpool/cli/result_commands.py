@@ -397,7 +397,7 @@ def fit(
       lidarpool fit --pattern recording.pcd --out mine.yaml
     """  # noqa: D301 - Click requires the character \b
     from ..clouds.folder import check_not_existing
-    from ..comparing.fit import fit as fitted
+    from ..comparing.fit.fitting import fit as fitted
     from ..processes.fork_server import keep_freed_memory
 
     keep_freed_memory()

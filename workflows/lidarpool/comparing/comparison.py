@@ -14,10 +14,10 @@ from matplotlib.colors import LogNorm, Normalize
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
+from lidarview.page_templates import millimeters, render_template
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
-from ..report.page.rendering import millimeters, render_template
 from .comparison_files import write_comparison
 from .range_image import RangeImages
 
@@ -59,7 +59,7 @@ class Comparison:
     points: Sequence[Floats]
 
     def __repr__(self) -> str:
-        return render_template("comparison.txt", report=self.figures).rstrip("\n")
+        return render_template("comparison.txt", __name__, report=self.figures).rstrip("\n")
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and the charts, and return their paths.
@@ -75,7 +75,9 @@ class Comparison:
         if self.images is not None:
             pages = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | pages
         pictures = {name: page.svg() for name, page in pages.items()}
-        report = render_template("comparison.html", report=self.figures, pictures=pictures)
+        report = render_template(
+            "comparison.html", __name__, report=self.figures, pictures=pictures
+        )
         return write_comparison(folder, self.figures, report, pages)
 
 

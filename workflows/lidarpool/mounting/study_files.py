@@ -20,9 +20,9 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.declared import declared_values
 from lidarsim.words import printable
+from lidarview.page_templates import render_template
 
 from ..clouds.folder import staging
-from ..report.page.rendering import render_template
 from ..scenario.mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .pictures import draw_all
@@ -79,6 +79,7 @@ def write_study(result: MountRanking, folder: Path) -> list[Path]:
             FIGURES_FILE: json.dumps(figures, indent=1, allow_nan=False) + "\n",
             PAGE_FILE: render_template(
                 "mount.html",
+                __name__,
                 report=report,
                 pictures=pictures,
                 shown=SHOWN_CANDIDATES,

@@ -35,14 +35,7 @@ from ..work.lost_workers import LostWorkersError
 from ..work.mapping import MapFunction, parallel_map
 from .air_returns import AirStatistics
 from .alignment import AlignedSweeps, Alignment, first_alignment
-from .charts import (
-    STATIONARY_DOTS,
-    SweepImages,
-    TopViewPoints,
-    draw_errors,
-    draw_sweep,
-    draw_top_view,
-)
+from .chart_data import STATIONARY_DOTS, SweepImages, TopViewPoints
 from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
 from .isolated_returns import IsolatedRanges
@@ -439,6 +432,8 @@ class _Building:
                 *_stationary_notes(alignment),
             ],
         }
+        from .charts import draw_errors, draw_sweep, draw_top_view  # imports Matplotlib
+
         pictures = {
             "sweep": draw_sweep(built.images()),
             "above": draw_top_view(

@@ -8,13 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
+from lidarsim.numerics.arrays import Floats, Floats32
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
-from ..clouds.rings import elevations
-from .alignment import AlignedSweep, AlignedSweeps
-from .held_out import HeldOutRays
+from .chart_data import MOVED_DOTS, STATIONARY_DOTS, SweepImages, TopViewPoints
 
 _WIDTH = 1600
 _LEFT = 0.075
@@ -25,11 +23,7 @@ _ABOVE_HEIGHT = 1000
 _ABOVE_FRAME = (_LEFT, 0.09, 0.86, 0.76)  # left, bottom, width and height relative to the page
 _TOP = 150
 _BOTTOM = 90
-_COLUMNS = 720  # maximum number of image columns, 0.5° each
-_ROWS = 64  # number of image rows for a sensor without rings
 _DIFFERENCE_M = 0.1  # limit of the color scale for differences
-STATIONARY_DOTS = 150_000
-_MOVED_DOTS = 40_000
 _NO_RETURN = theme.rgb("#c8cbd0")
 _MOVED_COLOR = "#d7301f"
 _PATH_COLOR = "#08519c"
@@ -44,85 +38,9 @@ class _Image(NamedTuple):
     colors: str  # name of a colormap
 
 
-class SweepImages(NamedTuple):
-    """Images of a recorded sweep and its simulation.
-
-    The images have a row for each ring and a column for each azimuth. Their shape is (r, c), and
-    pixels without a return are NaN.
-    """
-
-    number: Ints  # (1,), number of the sweep
-    range_m: Floats32
-    simulated_m: Floats32
-    intensity: Floats32 | None
-    simulated_intensity: Floats32 | None
-
-    @classmethod
-    def from_rays(cls, sweeps: AlignedSweeps, rays: HeldOutRays, number: int) -> SweepImages:
-        """Create images of a held-out sweep and of its simulation."""
-        sweep = sweeps.read(number)
-        cells = _cells(sweep, sweeps)
-        simulated = rays.select(rays.return_mask & (rays.sweep == number))
-        range_m, in_twin_m = (
-            _image(values, cells) for values in (sweep.range_m, simulated.simulated_m)
-        )
-        if sweep.intensities is None or not np.isfinite(simulated.simulated_intensity).any():
-            return cls(np.array([number]), range_m, in_twin_m, None, None)
-        intensity, in_twin = (
-            _image(values, cells) for values in (sweep.intensities, simulated.simulated_intensity)
-        )
-        return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
-
-    def pictures(self) -> list[_Image]:
-        """Return the images of the recorded and the simulated sweep, and of their differences."""
-        near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
-        ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
-        differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
-        words = f"difference up to {1000 * _DIFFERENCE_M:.0f} mm (red: reconstruction is farther)"
-        images = [
-            _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLORS),
-            _Image("range, reconstructed", self.simulated_m, ranges, theme.RANGE_COLORS),
-            _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
-        ]
-        if self.intensity is not None and self.simulated_intensity is not None:
-            scale = Normalize(0, max(float(np.nanquantile(self.intensity, 0.98)), 1e-9))
-            images.append(_Image("intensity, recorded", self.intensity, scale, "gray"))
-            images.append(
-                _Image("intensity, reconstructed", self.simulated_intensity, scale, "gray")
-            )
-        return images
-
-
-class TopViewPoints(NamedTuple):
-    """Horizontal positions of sampled points in world coordinates."""
-
-    still: Floats32  # (n, 2), stationary points, meters
-    moved: Floats32  # (k, 2), points on moving objects, meters
-
-    @classmethod
-    def from_sweeps(
-        cls, sweeps: AlignedSweeps, stationary: Mapping[int, Bools], numbers: Ints, share: float
-    ) -> TopViewPoints:
-        """Sample points from several sweeps.
-
-        `share` is the fraction of the stationary points that are chosen. The number of points on
-        moving objects is limited for each sweep.
-        """
-        still: list[Floats] = []
-        moved: list[Floats] = []
-        for number in numbers.tolist():
-            mask = stationary[number]
-            world = sweeps.read(number).world[:, :2]
-            chosen = np.random.default_rng(number).random(len(world)) < share
-            still.append(world[mask & chosen])
-            moved.append(world[~mask][:_MOVED_DOTS])
-        parts = (np.concatenate(points).astype(np.float32) for points in (still, moved))
-        return cls(*parts)
-
-
 def draw_sweep(sweep: SweepImages) -> Page:
     """Draw the ranges and intensities of a recorded and a simulated sweep, and the differences."""
-    images = sweep.pictures()
+    images = _sweep_images(sweep)
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))
     page.title(f"Sweep {int(sweep.number[0])}", "held out from the reconstruction")
@@ -141,32 +59,22 @@ def draw_sweep(sweep: SweepImages) -> Page:
     return page
 
 
-def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int, int]]:
-    """Return the pixel index of each point, and the shape of the image."""
-    row_count = sweeps.recorded.ring_count
-    row = sweep.ring
-    if not len(sweeps.recorded.elevation_rad):
-        elevation = elevations(sweep.points)
-        low, high = np.quantile(elevation, (0, 1))
-        row_count = _ROWS
-        fraction = (high - elevation) / max(high - low, 1e-9)
-        row = (fraction * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
-    # If there were more columns than pulses per ring, the image would have empty stripes.
-    column_count = min(_COLUMNS, int(np.bincount(row).max()))
-    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
-    column = (turns * column_count).astype(np.int64) % column_count
-    return row * column_count + column, (row_count, column_count)
-
-
-def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
-    """Return an image with the values at their pixels.
-
-    If several values share a pixel, the last one is used. Empty pixels are NaN.
-    """
-    cell, shape = cells
-    image = np.full(shape[0] * shape[1], np.nan, np.float32)
-    image[cell] = values
-    return image.reshape(shape)
+def _sweep_images(sweep: SweepImages) -> list[_Image]:
+    """Return the images of the recorded and the simulated sweep, and of their differences."""
+    near_m, far_m = np.nanquantile(sweep.range_m, (0.01, 0.98)).tolist()
+    ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
+    differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
+    words = f"difference up to {1000 * _DIFFERENCE_M:.0f} mm (red: reconstruction is farther)"
+    images = [
+        _Image("range, recorded", sweep.range_m, ranges, theme.RANGE_COLORS),
+        _Image("range, reconstructed", sweep.simulated_m, ranges, theme.RANGE_COLORS),
+        _Image(words, sweep.simulated_m - sweep.range_m, differences, "RdBu_r"),
+    ]
+    if sweep.intensity is not None and sweep.simulated_intensity is not None:
+        scale = Normalize(0, max(float(np.nanquantile(sweep.intensity, 0.98)), 1e-9))
+        images.append(_Image("intensity, recorded", sweep.intensity, scale, "gray"))
+        images.append(_Image("intensity, reconstructed", sweep.simulated_intensity, scale, "gray"))
+    return images
 
 
 def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
@@ -187,7 +95,7 @@ def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
     axes = page.map_chart(_ABOVE_FRAME, (low + high) / 2 + [-half, half])
     for points, color, size, most in (
         (near, theme.UNSEEN, 1.0, STATIONARY_DOTS),
-        (moved, _MOVED_COLOR, 1.6, _MOVED_DOTS),
+        (moved, _MOVED_COLOR, 1.6, MOVED_DOTS),
     ):
         some = points[:: max(-(-len(points) // most), 1)]
         dots = size * page.unit**2

@@ -18,7 +18,7 @@ from lidarsim.sensor.models import Performance, SensorModel
 from lidarsim.words import plural
 
 from ..clouds.recording import Recording
-from ..comparing.fit import Fit, fit
+from ..comparing.fit.fitting import Fit, fit
 from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweeps, Alignment
 from .blocked_directions import BlockedDirections

@@ -15,7 +15,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from ..work.mapping import describe_sweeps
 from .air_returns import AirStatistics, find_air_returns
 from .alignment import AlignedSweeps, Alignment, align
-from .charts import SweepImages, TopViewPoints
+from .chart_data import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage

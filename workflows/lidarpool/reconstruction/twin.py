@@ -19,9 +19,10 @@ from lidarsim.motion.rotations import quaternions_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.models import SensorModel
+from lidarview.page_templates import render_template
 
 from ..clouds.folder import result_folder, staging
-from ..report.page.rendering import render_template
+from ..comparing import lidar4d
 from ..scenario.point_scene import CLASS_MATERIAL
 from .labels import SurfelMaterial
 from .recorded_actors import FOLDER as ACTORS_FOLDER
@@ -92,7 +93,9 @@ class Twin:
     classes: Mapping[int, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return render_template("twin.txt", report=self.figures).rstrip("\n")
+        return render_template("twin.txt", __name__, lidar4d.__name__, report=self.figures).rstrip(
+            "\n"
+        )
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the scene, drive and sensor, a scenario that uses all three, and a report.
@@ -129,7 +132,9 @@ class Twin:
                 for name in actor.write(staged / ACTORS_FOLDER)
             ]
             pictures = {name: page.svg() for name, page in self.pictures.items()}
-            page = render_template("twin.html", report=self.figures, pictures=pictures)
+            page = render_template(
+                "twin.html", __name__, lidar4d.__name__, report=self.figures, pictures=pictures
+            )
             stated = self.model.model_dump(mode="json", exclude_defaults=True)
             stated |= self.model.model_dump(mode="json", include=_ROTATION_FIELDS)
             model = {name: stated[name] for name in SensorModel.model_fields if name in stated}

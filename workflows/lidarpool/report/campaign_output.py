@@ -30,7 +30,8 @@ from ..identity.field_words import describe_changes
 from ..identity.job_errors import summarize_errors
 from ..identity.sealed import seal_json, unseal_json
 from ..identity.shard import ALL, Shard, describe_shard
-from ..identity.software import describe_difference, software
+from ..identity.software import describe_difference
+from ..identity.versions import software
 from ..run.cluster.cluster import ClusterConnection
 from ..run.committed import CommittedRun
 from ..run.listener import Listener

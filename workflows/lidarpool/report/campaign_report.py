@@ -13,15 +13,17 @@ import numpy as np
 
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
+from lidarview.page_templates import render_template
 from lidarview.render.picture_page import Page
 
 from ..clouds.folder import LAST_FILE
+from ..clouds.format_table import data_set_title
 from ..datasets.figures import DataSetStatistics
 from ..datasets.job_seconds import writing_seconds
 from ..datasets.job_table import JobRow
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_times, draw_varied
-from .page.rendering import render_template
+from .page import rendering
 from .report import stage_statistics
 
 CARD = "README.md"
@@ -98,20 +100,24 @@ def write_card(
             "report": report,
             "command": campaign["command"],
             "VALUES_SHOWN": VALUES_SHOWN,
+            "format_title": data_set_title(report["format"]),
         }
         on_page = {name: pages[name] for name in ("varied", "results")}
         on_page["times"] = draw_times(figures)
         page = render_template(
             "campaign.html",
+            rendering.__name__,
             captions=_PAGE_CAPTIONS,  # also read by screen readers
             pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
             slowest=figures.slowest,
             description=campaign["description"],
             **values,
-            stages=run.stages,
+            timeline=rendering.make_timeline(run.stages),
         )
         storage.write(PAGE, page.encode())
-        card = render_template("card.md", captions=_CAPTIONS, drawn=[*drawn], **values)
+        card = render_template(
+            "card.md", rendering.__name__, captions=_CAPTIONS, drawn=[*drawn], **values
+        )
         storage.write(CARD, card.encode("utf-8", "backslashreplace"))
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         storage.write(LAST_FILE, text.encode())

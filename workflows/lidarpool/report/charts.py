@@ -15,12 +15,12 @@ from lidarsim.columns.table import TABLE, Z, names_by_value
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import format_rounded, plural, shorten_name
+from lidarview.page_templates import NARROW
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import DataSetStatistics, VariedQuantity
-from .page.rendering import NARROW
 
 WIDTH = 1600
 MAX_VARIED = 8  # quantities per picture

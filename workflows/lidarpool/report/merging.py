@@ -24,7 +24,7 @@ from ..datasets.job_table import JobRow
 from ..identity.field_words import describe_changes
 from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
-from ..identity.software import software
+from ..identity.versions import software
 from ..open3d_access.open3d_module import load_open3d
 from ..plan import Trial
 from ..run.committed import CommittedRun

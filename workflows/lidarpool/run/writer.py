@@ -23,7 +23,7 @@ from ..clouds.multi_file_format import PieceRange, RangeWriter
 from ..clouds.multi_file_format import WrittenRange as Range
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
-from ..identity.software import plugin_versions
+from ..identity.versions import plugin_versions
 from .cluster.cluster import Cluster
 from .cluster.tasks import TaskGroup
 from .pipeline.casting_workers import submit_value

@@ -33,7 +33,7 @@ from ..clouds.format_table import check_all_returns
 from ..datasets.job_table import Value
 from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
-from ..identity.software import plugin_versions
+from ..identity.versions import plugin_versions
 from .campaign_file import is_campaign
 from .campaign_sections import (
     MAX_JOBS,

@@ -1,5 +1,1 @@
 """Fitting of sensor models to recordings."""
-
-from .fitting import Fit, fit
-
-__all__ = ["Fit", "fit"]

@@ -22,12 +22,11 @@ from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_number
 from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_model
 from lidarsim.words import plural
+from lidarview.page_templates import render_template
 
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
 from ...recordings.opening import open_recording
-from ...report.page.rendering import render_template
-from .charts import draw_charts
 from .estimates import Estimate
 from .known_poses import KnownPoses
 from .measured import SensorMeasurement, measure_moving, measure_standing
@@ -46,7 +45,7 @@ class Fit:
     model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:
-        return render_template("fit.txt", report=self.figures).rstrip("\n")
+        return render_template("fit.txt", __name__, report=self.figures).rstrip("\n")
 
     def save(self, file: str | Path) -> list[Path]:
         """Write the sensor file and an HTML report next to it, and return both paths.
@@ -62,11 +61,13 @@ class Fit:
                 f"{model_path} is not a sensor file. Use a file name with the extension .yaml, "
                 "such as mine.yaml."
             )
+        from .charts import draw_charts  # imports Matplotlib
+
         model = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
         pictures = {"fit": draw_charts(self.figures).svg()}
-        page = render_template("fit.html", report=self.figures, pictures=pictures)
+        page = render_template("fit.html", __name__, report=self.figures, pictures=pictures)
         contents = {model_path: text, model_path.with_suffix(".html"): page}
         advice = "choose an existing folder with enough free space"
         with explain_os_errors(f"{model_path} cannot be written", advice):

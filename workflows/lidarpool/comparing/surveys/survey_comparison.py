@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarsim.numerics.arrays import Floats
+from lidarview.page_templates import render_template
 
-from ...report.page.rendering import render_template
 from ..comparison_files import write_comparison
 from .deviations import STATISTICS
 from .survey_charts import draw_histograms, draw_maps
@@ -34,7 +34,7 @@ class SurveyComparison:
     components: dict[str, Floats]  # {name: deviations of shape (n,)} in meters
 
     def __repr__(self) -> str:
-        text = render_template("survey.txt", report=self.figures, labels=LABELS)
+        text = render_template("survey.txt", __name__, report=self.figures, labels=LABELS)
         return text.rstrip("\n")
 
     def table(self) -> str:
@@ -67,7 +67,7 @@ class SurveyComparison:
         }
         pictures = {name: page.svg() for name, page in pages.items()}
         report = render_template(
-            "survey.html", report=self.figures, pictures=pictures, labels=LABELS
+            "survey.html", __name__, report=self.figures, pictures=pictures, labels=LABELS
         )
         texts = {"compare.csv": self.table()}
         return write_comparison(folder, self.figures, report, pages, texts)

@@ -21,7 +21,8 @@ from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
 from ...clouds.writing import ExportSpec
-from ...identity.software import describe_difference, software, software_query
+from ...identity.software import describe_difference, software_query
+from ...identity.versions import software
 from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT

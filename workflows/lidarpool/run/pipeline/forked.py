@@ -19,7 +19,7 @@ import tornado.platform.asyncio  # noqa: F401
 
 import poolpart.deploy.local  # noqa: F401
 
-from ...identity import software
+from ...identity import versions
 from ...plan import trial  # noqa: F401
 from ...processes.fork_server import keep_freed_memory
 from . import casting_workers, long_stage_tasks  # noqa: F401
@@ -36,5 +36,5 @@ with suppress(ImportError):  # a later check reports why the module cannot be lo
         print("note: the ray caster was compiled for this processor", file=sys.stderr)  # noqa: T201
 # Cache the versions of packages and the hash of the sources, which are read from many files.
 distributed.versions.get_versions()
-software.source_hash()
+versions.source_hash()
 gc.freeze()  # otherwise, garbage collection in a worker would copy shared memory pages

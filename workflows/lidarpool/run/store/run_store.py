@@ -25,7 +25,7 @@ from ...datasets.job_table import JobRow
 from ...identity.field_words import describe_changes
 from ...identity.fingerprint import fingerprint
 from ...identity.shard import ALL, describe_shard
-from ...identity.software import software
+from ...identity.versions import software
 from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
