@@ -9,10 +9,12 @@ from multiprocessing import spawn
 import dask
 import psutil
 import pytest
-from distributed import Client
+from distributed import Client, Scheduler, Worker
+from tests.clusters import QUIET
 
 from poolpart import Pool, PoolError
 from poolpart.deploy import local, local_cluster
+from poolpart.deploy.local_processes import FixedCluster
 
 SCRIPT = """
 import sys, time
@@ -196,6 +198,24 @@ LATE = """
         while len(waiting) < 3:
             time.sleep(0.05)
 """
+
+
+def test_a_worker_that_leaves_while_a_client_counts_workers_is_no_error(wait_until):
+    """The count may precede the message that the worker has left, which then removes nothing."""
+    options = {"host": "127.0.0.1", "dashboard": False}
+    scheduler = {"cls": Scheduler, "options": {**options, "dashboard_address": "127.0.0.1:0"}}
+    workers = {name: {"cls": Worker, "options": {"nthreads": 1, **options}} for name in range(2)}
+    with (
+        FixedCluster(workers=workers, scheduler=scheduler, silence_logs=QUIET) as cluster,
+        Client(cluster) as client,
+    ):
+        client.wait_for_workers(2, timeout=60)
+        left, stays = cluster.scheduler_info["workers"]
+        del cluster.scheduler_info["workers"][left]
+        client.retire_workers([left])
+        wait_until(lambda: [*cluster.scheduler.workers] == [stays])
+        client.retire_workers([stays])
+        wait_until(lambda: not cluster.scheduler_info["workers"])
 
 
 @pytest.mark.slow

@@ -83,9 +83,15 @@ class FixedCluster(SpecCluster):
     15 seconds after a worker was lost, a plain SpecCluster closes the nanny of this worker unless a
     worker with the same name is present. A worker that dies twice within this time may just be
     restarting at that moment, and would never return.
+
+    In distributed 2026.8, `Client.wait_for_workers` replaces the worker list. If a worker leaves
+    meanwhile, its removal is announced although the new list does not contain it. A plain cluster
+    would raise KeyError when it closes.
     """
 
     def _update_worker_status(self, op: str, msg: Any) -> None:
+        if op == "remove" and msg not in self.scheduler_info["workers"]:
+            return
         super(SpecCluster, self)._update_worker_status(op, msg)
 
     def scale(self, n: int = 0, **options: Any) -> None:
