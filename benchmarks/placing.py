@@ -30,6 +30,7 @@ from distributed.scheduler import WorkerState
 from poolpart.choosing import NAME as CHOICE
 from poolpart.features import enable_features
 from poolpart.fence import raise_fence
+from poolpart.shares import NAME as SHARES
 
 from .harness import argument_parser, write_results
 
@@ -117,7 +118,6 @@ class Tasks:
         for state in states:
             self.scheduler.transitions({state.key: "waiting"}, "benchmark")
         seconds = time.perf_counter() - start
-        assert all(state.processing_on for state in states)
         return states, seconds
 
     def end(self, states: list[Any]) -> None:
@@ -134,6 +134,8 @@ class Tasks:
                 startstops=[],
             )
             self.scheduler.transitions({state.key: "forgotten"}, "benchmark")
+        # In a partition, tasks wait on the scheduler until a slot is free.
+        self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id="benchmark")
 
 
 def cost_us(scheduler: Any, partition: bool, number: int) -> float:
@@ -142,6 +144,7 @@ def cost_us(scheduler: Any, partition: bool, number: int) -> float:
     rounds = []
     for _ in range(3):
         states, seconds = tasks.assign(number)
+        assert all(state.processing_on for state in states)
         tasks.end(states)
         rounds.append(seconds / number * 1e6)
     return min(rounds)
@@ -166,6 +169,7 @@ def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
     queues: dict[Any, deque[Any]] = defaultdict(deque)  # {worker: states of its tasks}
     events: list[tuple[float, int, Any]] = []  # heap: end, number of the task, worker
     numbers: dict[Any, int] = {}  # {state of a task: its number}
+    waiting: list[Any] = []  # states of tasks without a worker
     end_times: list[float] = []
     longest_queue = 0
 
@@ -179,6 +183,9 @@ def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
         states, _ = tasks.assign(min(count, len(durations) - len(numbers)))
         for state in states:
             numbers[state] = len(numbers)
+        waiting.extend(states)
+        for state in [state for state in waiting if state.processing_on]:
+            waiting.remove(state)
             queue = queues[state.processing_on]
             queue.append(state)
             longest_queue = max(longest_queue, len(queue))
@@ -204,6 +211,7 @@ async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, 
             raise_fence(scheduler, PARTITION)
             if label == "dask":
                 scheduler.plugins[CHOICE].uninstall()
+                scheduler.plugins[SHARES].remove_partition(PARTITION)
             add_workers(scheduler, number)
             for name, partition in (("partition", True), ("others", False)):
                 figures[f"{name}_{label}_us"] = cost_us(scheduler, partition, rounds)

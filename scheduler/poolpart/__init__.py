@@ -11,7 +11,7 @@ from .extras.cancelling import cancelled
 from .extras.listening import PipeListener
 from .mapping import Results
 from .partition import Partition
-from .partition_stats import PartitionStats, StageStats
+from .partition_stats import ClientStats, PartitionStats, StageStats
 from .pipe import Pipe
 from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
@@ -21,6 +21,7 @@ from .workers import WorkerInfo
 __all__ = [
     "BalanceStats",
     "BalancedGroup",
+    "ClientStats",
     "DemandStats",
     "Partition",
     "PartitionStats",

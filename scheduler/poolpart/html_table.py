@@ -21,7 +21,7 @@ _PARAGRAPH = Template("<p>{{ text }}</p>\n")
 # Columns that contain text and are left-aligned. Numbers are right-aligned.
 TEXT_COLUMNS = frozenset(
     {
-        *("", "partition", "stage", "worker", "pipe", "state", "status", "address"),
+        *("", "partition", "stage", "client", "worker", "pipe", "state", "status", "address"),
         *("time", "from", "to", "reason"),  # columns of moves
     }
 )

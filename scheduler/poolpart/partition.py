@@ -225,7 +225,8 @@ class Partition:
             Key of the task. By default, a new key is generated for each call, so identical calls
             run separately.
         priority
-            Priority of the task. Tasks with a higher priority run first.
+            Priority of the task among the tasks of the same client. Tasks with a higher priority
+            run first. Clients take turns, whatever their priorities are.
         retries
             Maximum number of times that the task runs again after an error.
         slots
@@ -344,7 +345,7 @@ class Partition:
             results. Pass 1 if processing times vary considerably, or if items must not wait for
             others.
         priority
-            Priority of the tasks. Tasks with a higher priority run first.
+            Priority of the tasks among the tasks of the same client, as in `submit`.
         retries
             Minimum number of times that a failed item is retried.
         slots

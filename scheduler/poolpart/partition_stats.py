@@ -13,6 +13,7 @@ COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in t
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
 NO_PARTITION = "no partition"  # label for workers without a partition and for plain Dask tasks
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
+HEAD_OF_CLIENTS = ("client", "weight", "share", "slots", "waiting", "wait", "seconds")
 HEAD_OF_QUEUES = ("partition", "waiting jobs of others", "jobs being released", "state")
 
 
@@ -53,6 +54,50 @@ class SharedQueue:
         if self.waiting is None:
             return ["unknown", self.releasing, f"cannot be listed: {self.problem}"]
         return [self.waiting, self.releasing, "listed"]
+
+
+@dataclass(frozen=True)
+class ClientStats:
+    """Use of a partition by one client, which includes the nested tasks of its tasks.
+
+    Parameters
+    ----------
+    weight
+        Weight of the client, as set by `Pool.set_weight`.
+    share
+        Fraction of the slot time of the last minute that the client's finished tasks have used.
+    slots
+        Number of slots that the client's tasks take, including short tasks that were assigned to
+        workers in advance.
+    waiting
+        Number of tasks that wait for a slot.
+    wait_s
+        Mean time in seconds that recent tasks have waited for a slot.
+    seconds
+        Total slot time of finished tasks in seconds.
+    queued_seconds
+        Total time in seconds that tasks have waited for a slot.
+    """
+
+    weight: float = 1.0
+    share: float = 0.0
+    slots: int = 0
+    waiting: int = 0
+    wait_s: float = 0.0
+    seconds: float = 0.0
+    queued_seconds: float = 0.0
+
+    @property
+    def cells(self) -> list[object]:
+        """Table cells in the order of the columns, after the name of the client."""
+        return [
+            f"{self.weight:g}",
+            f"{self.share:.0%}",
+            self.slots,
+            self.waiting,
+            format_seconds(self.wait_s),
+            format_seconds(self.seconds),
+        ]
 
 
 @dataclass(frozen=True)
@@ -132,6 +177,8 @@ class PartitionStats(StageStats):
         Whether other tasks are kept off the workers.
     stages
         Counts of each stage, by name.
+    clients
+        Use of the partition by each client, by name or, if a client has no name, by its ID.
     since
         Time in UTC when counting began.
     queue
@@ -145,6 +192,7 @@ class PartitionStats(StageStats):
     busy: int = 0
     exclusive: bool = False
     stages: Mapping[str, StageStats] = field(default_factory=dict)
+    clients: Mapping[str, ClientStats] = field(default_factory=dict)
     since: datetime | None = None
     target: int | None = None
     queue: SharedQueue | None = None
@@ -156,7 +204,10 @@ class PartitionStats(StageStats):
         lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""
         queue = f", {self.queue}" if self.queue else ""
         title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}{queue}>"
-        return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
+        tables = [text_table(_HEAD_OF_STAGES, [*stages, ["all", *self._figures]])]
+        if len(self.clients) > 1:
+            tables.append(text_table(HEAD_OF_CLIENTS, self._client_rows))
+        return "\n".join([title, *tables])
 
     def _repr_html_(self) -> str:
         name = self.name or NO_PARTITION
@@ -165,6 +216,12 @@ class PartitionStats(StageStats):
         if self.stages:
             stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
             tables += html_table("Stages", _HEAD_OF_STAGES, stages)
+        if len(self.clients) > 1:
+            tables += html_table("Clients", HEAD_OF_CLIENTS, self._client_rows)
         if self.queue:
             tables += html_table("Shared queue", HEAD_OF_QUEUES, [[name, *self.queue.cells]])
         return tables
+
+    @property
+    def _client_rows(self) -> list[list[object]]:
+        return [[client, *stats.cells] for client, stats in self.clients.items()]

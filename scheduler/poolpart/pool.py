@@ -24,6 +24,7 @@ from .pipe_states import names_of_pipes
 from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
+from .shares import check_weight, client_name, set_weight
 from .steward import names_with_rule
 from .workers import WorkerInfo, all_workers, run_on_scheduler, run_on_workers, slots_note
 
@@ -488,6 +489,42 @@ class Pool:
             )
         names = [part.name if isinstance(part, Partition) else part for part in partitions]
         return balance_partitions(self.client, names, min, max, workers)
+
+    def set_weight(self, client: Client | str, weight: float) -> None:
+        """Give a client a larger or smaller share of the slots of all partitions.
+
+        If tasks of several clients wait in a partition, each client gets slot time in proportion to
+        its weight, which is 1 by default. The weight does not reserve slots: if a client has no
+        tasks, the others use its share.
+
+        Parameters
+        ----------
+        client
+            Client, or the name of a client, as in ``Client(address, name="alice")``. Clients with
+            the same name share one weight. The name is known to the scheduler from now on, also
+            when the client returns, and before its first task.
+        weight
+            Positive number. A client with a weight of 3 gets three times as much slot time as one
+            with a weight of 1.
+
+        Raises
+        ------
+        PoolError
+            If the weight is not a positive number, if the name is empty, or if the installed
+            version of Dask does not support shares.
+
+        Examples
+        --------
+        >>> pool.set_weight("alice", 3)                                    # doctest: +SKIP
+        """
+        name = client_name(client.id) if isinstance(client, Client) else client
+        if not isinstance(name, str) or not name:
+            raise PoolError(
+                f"Invalid client {client!r}. Expected a client or its name, for example "
+                '`Client(address, name="alice")` or "alice".'
+            )
+        number = check_weight(weight)
+        run_on_scheduler(self.client, set_weight, name=name, weight=number)
 
     def page(self) -> str:
         """Add a page to Dask's dashboard, and return its URL.

@@ -19,6 +19,7 @@ from .adapting import shared_queue_of
 from .features import FEATURES
 from .fence import fence_names
 from .partition_stats import PartitionStats, StageStats, describe_size
+from .shares import clients_of
 from .steward import target_of
 from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
@@ -301,6 +302,7 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 since=to_datetime(statistics.since),
                 target=target_of(scheduler, name),
                 stages=stages,
+                clients=clients_of(scheduler, name),
                 queue=shared_queue_of(scheduler, name),
                 **sums,
             )

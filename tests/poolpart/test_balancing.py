@@ -261,6 +261,9 @@ def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_lef
     a, _ = pool.partition("A", workers=["a", "b"])
     b, _ = pool.partition("B", workers=["c", "d"])
     workers = {w.name: w for w in client.cluster.scheduler.workers.values()}
+    released.set()
+    client.gather([a.submit(hold) for _ in range(2)])  # workers only receive short tasks in advance
+    released.clear()
     with balance(client, [a, b], min=2) as group:
         tasks = [a.submit(hold) for _ in range(8)]
         wait_until(lambda: len(workers["a"].processing) == len(workers["b"].processing) == 4)

@@ -62,9 +62,12 @@ def divided(start):
 def test_what_has_not_started_is_shared_out_evenly(divided, wait_until):
     client, parts = divided
     event = Event("evenly", client)
-    tasks = [parts["A"].submit(wait_for, "evenly") for _ in range(60)]
+    event.set()
+    parts["A"].submit(wait_for, "evenly").result()  # workers only receive short tasks in advance
+    event.clear()
+    tasks = [parts["A"].submit(wait_for, "evenly") for _ in range(45)]
     scheduler = client.cluster.scheduler
-    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 60)
+    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 45)
     members_of_a = [scheduler.workers[worker.address] for worker in parts["A"].workers]
     moving = threading.Thread(target=parts["A"].shrink)
     moving.start()
@@ -74,7 +77,8 @@ def test_what_has_not_started_is_shared_out_evenly(divided, wait_until):
     event.set()
     moving.join()
     client.gather(tasks)
-    assert given in ([1, 29, 30], [1, 28, 31], [1, 27, 32])
+    assert given[0] == 1
+    assert given[2] - given[1] <= 5
 
 
 def test_a_partition_is_resized_to_a_number_of_workers(divided):

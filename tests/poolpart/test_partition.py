@@ -44,7 +44,7 @@ def test_higher_priority_runs_first(b, client, wait_until):
     low = [b.submit(stamp) for _ in range(3)]
     high = [b.submit(stamp, priority=5) for _ in range(3)]
     keys = {future.key for future in (blocker, *low, *high)}
-    wait_until(lambda: keys <= client.cluster.workers["B-0"].state.tasks.keys())
+    wait_until(lambda: keys <= client.cluster.scheduler.tasks.keys())
     Event(gate, client=client).set()
     assert blocker.result()
     assert max(future.result() for future in high) < min(future.result() for future in low)

@@ -26,7 +26,13 @@ from ..html_table import TEXT_COLUMNS, format_seconds
 from ..internals.names import PAGE, require_feature
 from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
-from ..partition_stats import COUNTS, HEAD_OF_QUEUES, NO_PARTITION, StageStats
+from ..partition_stats import (
+    COUNTS,
+    HEAD_OF_CLIENTS,
+    HEAD_OF_QUEUES,
+    NO_PARTITION,
+    StageStats,
+)
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
 from ..stats import (
@@ -106,11 +112,13 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
     queues: list[list[object]] = []
+    clients: list[list[object]] = []
     pipes: list[list[object]] = []
     for p in stats_of(shown, scheduler):
         title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+        clients += [[client, _label(p.name), *stats.cells] for client, stats in p.clients.items()]
         if p.queue:
             queues.append([p.name, *p.queue.cells])
     rows_of_workers = sorted(
@@ -124,6 +132,7 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     tables = [
         ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
         ("Stages", ["stage", "partition", *_FIGURES], stages),
+        ("Clients", [HEAD_OF_CLIENTS[0], "partition", *HEAD_OF_CLIENTS[1:]], clients),
         ("Shared queues", HEAD_OF_QUEUES, queues),
         ("Workers", _OF_A_WORKER, rows_of_workers),
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),

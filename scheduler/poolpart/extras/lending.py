@@ -49,6 +49,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
 from ..internals.client import install_wait_hooks, name_submitter_in_coroutines
+from ..internals.held_tasks import LOANS
 from ..internals.names import CLIENTS, missing_names
 from ..internals.partition_client import show_partitions_to_tasks
 from ..internals.scheduler import Resources, SubmittingTask, call_worker
@@ -118,6 +119,7 @@ class Lender:
         """Release the slots of a loan, so that other tasks can use them."""
         self._loans[loan.key] += 1
         self._lent.add(loan.key)
+        self._report(loan.key, True)
         release_slots(self.worker, loan.slots)
         self.return_slots()
 
@@ -126,6 +128,7 @@ class Lender:
         self._loans[loan.key] -= 1
         if not self._loans[loan.key]:
             del self._loans[loan.key]
+        self._report(loan.key, False)
         reserve_slots(self.worker, loan.slots)
         self._returning.append(loan)
         self.return_slots()
@@ -138,6 +141,10 @@ class Lender:
     def end_rejoin(self, key: Any) -> None:
         """Record that a waiting task has a thread again."""
         self._rejoining.discard(key)
+
+    def _report(self, key: Any, lent: bool) -> None:
+        """Report to the scheduler that a task has lent its slots, or has taken them back."""
+        self.worker.log_event(LOANS, {"key": key, "lent": lent})
 
     def return_slots(self) -> None:
         """Return free slots to waiting tasks in the order in which the tasks asked for them.
@@ -177,6 +184,7 @@ class Lender:
                 slots = {n: s for n, s in slots.items() if count_slots(self.worker, n)[1]}
                 set_resources_to_release(task, {**task.resource_restrictions, **slots})
                 reserve_slots(self.worker, slots)
+                self._report(key, False)
         if not self.has_slot_requests():
             return
         for key in seceded.keys() - self._seceded.keys() - self.lending:
@@ -186,6 +194,7 @@ class Lender:
                 others = {n: s for n, s in task.resource_restrictions.items() if n not in slots}
                 set_resources_to_release(task, others)
                 self._seceded[key] = slots
+                self._report(key, True)
                 release_slots(self.worker, slots)
 
     # -- demand for slots --------------------------------------------------------------

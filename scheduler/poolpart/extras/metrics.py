@@ -7,7 +7,7 @@ metrics of the whole cluster do not show.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -15,6 +15,7 @@ import dask
 
 from ..balancing import current_loads, move_counts
 from ..features import FEATURES, Feature
+from ..partition_stats import PartitionStats
 
 _LABELS = ["partition"]
 
@@ -32,43 +33,10 @@ class PartitionCollector:
     def collect(self) -> Iterator[Any]:
         """Yield all metric families. The label "" stands for tasks without a partition."""
         namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")
-        yield from self._partition_families(f"{namespace}_partition")
+        all_stats = self._statistics.all_stats()
+        yield from _partition_families(f"{namespace}_partition", all_stats)
+        yield from _client_families(f"{namespace}_partition_client", all_stats)
         yield from self._balance_families(f"{namespace}_partition_balance")
-
-    def _partition_families(self, prefix: str) -> Iterator[Any]:
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-
-        gauges = {
-            "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
-            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots on all workers", labels=_LABELS),
-            "busy": GaugeMetricFamily(f"{prefix}_busy_slots", "Slots in use", labels=_LABELS),
-        }
-        tasks = GaugeMetricFamily(f"{prefix}_tasks", "Unfinished tasks", labels=[*_LABELS, "state"])
-        ended = CounterMetricFamily(
-            f"{prefix}_tasks_ended", "Finished tasks", labels=[*_LABELS, "state"]
-        )
-        running = CounterMetricFamily(
-            f"{prefix}_running_seconds", "Running time of finished tasks", labels=_LABELS
-        )
-        waiting = CounterMetricFamily(
-            f"{prefix}_waiting_seconds",
-            "Time that finished tasks waited for a worker or a slot",
-            labels=_LABELS,
-        )
-        piping = CounterMetricFamily(
-            f"{prefix}_pipe_seconds", "Time that tasks waited for pipes", labels=_LABELS
-        )
-        for stats in self._statistics.all_stats():
-            for field, family in gauges.items():
-                family.add_metric([stats.name], getattr(stats, field))
-            for state in ("waiting", "queued", "running"):
-                tasks.add_metric([stats.name, state], getattr(stats, state))
-            for state in ("done", "failed"):
-                ended.add_metric([stats.name, state], getattr(stats, state))
-            running.add_metric([stats.name], stats.seconds)
-            waiting.add_metric([stats.name], stats.queued_seconds)
-            piping.add_metric([stats.name], stats.pipe_seconds)
-        yield from (*gauges.values(), tasks, ended, running, waiting, piping)
 
     def _balance_families(self, prefix: str) -> Iterator[Any]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -100,6 +68,74 @@ class PartitionCollector:
         for pair, count in move_counts(scheduler).items():
             moves.add_metric(pair, count)
         yield from (share, *gauges.values(), moves)
+
+
+def _partition_families(prefix: str, all_stats: Iterable[PartitionStats]) -> Iterator[Any]:
+    """Yield the metric families with one label, the partition."""
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    gauges = {
+        "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
+        "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots on all workers", labels=_LABELS),
+        "busy": GaugeMetricFamily(f"{prefix}_busy_slots", "Slots in use", labels=_LABELS),
+    }
+    tasks = GaugeMetricFamily(f"{prefix}_tasks", "Unfinished tasks", labels=[*_LABELS, "state"])
+    ended = CounterMetricFamily(
+        f"{prefix}_tasks_ended", "Finished tasks", labels=[*_LABELS, "state"]
+    )
+    running = CounterMetricFamily(
+        f"{prefix}_running_seconds", "Running time of finished tasks", labels=_LABELS
+    )
+    waiting = CounterMetricFamily(
+        f"{prefix}_waiting_seconds",
+        "Time that finished tasks waited for a worker or a slot",
+        labels=_LABELS,
+    )
+    piping = CounterMetricFamily(
+        f"{prefix}_pipe_seconds", "Time that tasks waited for pipes", labels=_LABELS
+    )
+    for stats in all_stats:
+        for field, family in gauges.items():
+            family.add_metric([stats.name], getattr(stats, field))
+        for state in ("waiting", "queued", "running"):
+            tasks.add_metric([stats.name, state], getattr(stats, state))
+        for state in ("done", "failed"):
+            ended.add_metric([stats.name, state], getattr(stats, state))
+        running.add_metric([stats.name], stats.seconds)
+        waiting.add_metric([stats.name], stats.queued_seconds)
+        piping.add_metric([stats.name], stats.pipe_seconds)
+    yield from (*gauges.values(), tasks, ended, running, waiting, piping)
+
+
+def _client_families(prefix: str, all_stats: Iterable[PartitionStats]) -> Iterator[Any]:
+    """Yield the metric families with two labels, the partition and the client."""
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    labels = [*_LABELS, "client"]
+    gauges = {
+        "weight": GaugeMetricFamily(f"{prefix}_weight", "Weight", labels=labels),
+        "share": GaugeMetricFamily(
+            f"{prefix}_share", "Fraction of the recently used slot time", labels=labels
+        ),
+        "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots in use", labels=labels),
+        "waiting": GaugeMetricFamily(
+            f"{prefix}_waiting_tasks", "Tasks that wait for a slot", labels=labels
+        ),
+    }
+    counters = {
+        "seconds": CounterMetricFamily(
+            f"{prefix}_slot_seconds", "Slot time of finished tasks", labels=labels
+        ),
+        "queued_seconds": CounterMetricFamily(
+            f"{prefix}_waiting_seconds", "Time that tasks waited for a slot", labels=labels
+        ),
+    }
+    families = gauges | counters
+    for stats in all_stats:
+        for client, of_client in stats.clients.items():
+            for field, family in families.items():
+                family.add_metric([stats.name, client], getattr(of_client, field))
+    yield from families.values()
 
 
 class _Metrics(Feature):

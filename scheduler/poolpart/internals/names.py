@@ -40,6 +40,7 @@ CANCELLING = "Partition.cancel"
 CLIENTS = "Partition.as_client"
 BALANCING = "Pool.balance"
 BLAMING = "blaming the death of a worker on running tasks only"
+SHARES = "fair shares"
 READING = "errors for inputs that cannot be unpickled"
 
 
@@ -193,6 +194,23 @@ PRIVATE_NAMES = (
         ),
         "compare a few workers per task instead of all",
         ("test_choosing.py::test_simulated_workers_get_tasks_as_evenly_as_from_dask",),
+    ),
+    PrivateNames(
+        SHARES,
+        (
+            f"{_SCHEDULER}.decide_worker_non_rootish(ts)",
+            f"{_SCHEDULER}.bulk_schedule_unrunnable_after_adding_worker(ws)",
+            f"{_SCHEDULER}.stimulus_queue_slots_maybe_opened(stimulus_id)",
+            f"{_SCHEDULER}.transitions",
+            f"{_SCHEDULER}.unrunnable",
+            f"{_SCHEDULER}.no_workers_timeout",
+            f"{_SCHEDULER}.generation",
+            f"{_SCHEDULER_TASK}.priority",
+            f"{_SCHEDULER_TASK}.who_wants",
+            f"{_SCHEDULER_TASK}.annotations",
+        ),
+        "hold tasks back until a slot is free; let clients take turns",
+        ("test_shares.py::test_a_second_client_does_not_wait_for_all_tasks_of_the_first",),
     ),
     PrivateNames(
         SHUFFLES,

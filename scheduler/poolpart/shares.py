@@ -1,0 +1,684 @@
+"""Let the clients of a partition take turns, by holding tasks back until a slot is free.
+
+Dask assigns a task that requests a resource to a worker as soon as its inputs are available, so a
+client that submits 1,000 tasks would be served before all clients that follow. In a partition, the
+scheduler keeps such tasks in the state "no-worker" instead, until a worker has room for another
+task (`share_policy.has_room`). Then `SharePolicy` decides which client is next. The tasks of one
+client are assigned in Dask's order, which includes their priorities.
+
+The priority of an assigned task begins with a number that increases with each assignment, so that
+its worker runs tasks in this order as well. It restarts with the original priority if it has to be
+assigned again.
+
+A task counts for the client that was the first to submit it, and a nested task for the client of
+the task that has submitted it. Clients with the same name are the same client.
+
+A task that waits for a nested task only lends its slots if the nested task waits on the same
+worker (see `extras.lending`). Therefore, one nested task more than there are slots may be assigned
+to the worker of the task that has submitted it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+import math
+import time
+from collections.abc import Iterable, Iterator, Set
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from .errors import PoolError
+from .features import FEATURES, Feature
+from .internals.held_tasks import (
+    LOANS,
+    add_holding_rules,
+    assign_held_tasks,
+    priority_of_assigned,
+    priority_of_waiting,
+    refresh_waiting_times,
+)
+from .internals.method_rules import MethodRules
+from .internals.names import SHARES, require_feature
+from .internals.placing import can_run, earliest_worker, holders_of_inputs, workers_declaring
+from .internals.scheduler import SUBMITTER, SubmittingTask
+from .partition_stats import ClientStats
+from .share_policy import SharePolicy, has_room
+
+NAME = "poolpart-shares"
+CHECK_EVERY_S = 0.5  # interval between checks for tasks that run longer than expected
+MAX_COMPARED = 10  # number of workers that are compared for a task
+MAX_HOLDERS = 50  # number of copies of inputs that are considered for a task
+_UUID_LETTERS = 36
+
+
+class _Bounds(NamedTuple):
+    """What restricts the workers of a task, apart from its partition."""
+
+    is_nested: bool = False
+    workers: frozenset[str] | None = None
+    hosts: frozenset[str] | None = None
+
+
+_ANY_WORKER = _Bounds()
+
+
+@dataclass
+class _HeldTask:
+    """Task that waits on the scheduler."""
+
+    client: str
+    bounds: _Bounds
+    since: float  # time.monotonic()
+    task: Any
+
+
+@dataclass
+class _Assignment:
+    """Task that is assigned to a worker, with its contribution to the load of the worker."""
+
+    worker: Any
+    slots: float
+    seconds: float  # expected slot time
+    is_nested: bool
+    is_lent: bool = False
+
+
+@dataclass
+class _Load:
+    """Slots that the assigned tasks of a worker request."""
+
+    used: float = 0.0
+    nested: float = 0.0  # slots that nested tasks request, which are included in `used`
+    seconds: float = 0.0  # expected slot time of the tasks
+
+
+@dataclass
+class PartitionQueue:
+    """Tasks of a partition that wait on the scheduler, and the load of its workers."""
+
+    name: str
+    policy: SharePolicy = field(default_factory=SharePolicy)
+    held: dict[Any, _HeldTask] = field(default_factory=dict)  # by key
+    # {client: {bounds: heap of (priority, number, key)}}. Entries of other tasks are skipped.
+    heaps: dict[str, dict[_Bounds, list[tuple[Any, int, Any]]]] = field(default_factory=dict)
+    pushed: int = 0  # number of entries that were added to the heaps
+    assigned: dict[Any, _Assignment] = field(default_factory=dict)  # by key
+    loads: dict[Any, _Load] = field(default_factory=dict)  # by worker
+    # Workers that have room for a task, starting with the one that has had room the longest.
+    with_room: dict[Any, None] = field(default_factory=dict)
+    nested_held: int = 0  # number of nested tasks among `held`
+    idle_s: float = 0.0  # slot time for which slots had no tasks, in seconds
+    free_slots: float = 0.0  # number of slots without tasks
+    free_since: float = field(default_factory=time.monotonic)  # time of the last change
+
+    # -- workers -----------------------------------------------------------------------
+
+    def update_worker(self, worker: Any) -> None:
+        """Determine whether a worker has room, after its load or its slots have changed."""
+        slots = worker.resources.get(self.name, 0)
+        load = self.loads.get(worker)
+        if load is None:
+            if not slots:
+                self.with_room.pop(worker, None)
+                return
+            load = self.loads[worker] = _Load()
+        if slots and has_room(slots, load.used, load.seconds):
+            self.with_room.setdefault(worker)
+        else:
+            self.with_room.pop(worker, None)
+
+    def forget_worker(self, worker: Any) -> None:
+        """Forget a worker that has left. Its tasks have been released before."""
+        self.loads.pop(worker, None)
+        self.with_room.pop(worker, None)
+
+    def assign(self, key: Any, assignment: _Assignment) -> None:
+        """Add a task to the load of its worker."""
+        self.assigned[key] = assignment
+        self._add_load(assignment, 1)
+
+    def unassign(self, key: Any) -> bool:
+        """Remove a task from the load of its worker, and return whether it was assigned."""
+        assignment = self.assigned.pop(key, None)
+        if assignment is None:
+            return False
+        if not assignment.is_lent:
+            self._add_load(assignment, -1)
+        return True
+
+    def set_lent(self, key: Any, lent: bool) -> None:
+        """Record that a task has lent its slots, or has them back."""
+        assignment = self.assigned.get(key)
+        if assignment is not None and assignment.is_lent != lent:
+            assignment.is_lent = lent
+            self._add_load(assignment, -1 if lent else 1)
+
+    def move(self, key: Any, worker: Any) -> None:
+        """Record that an assigned task was moved to another worker."""
+        assignment = self.assigned[key]
+        if not assignment.is_lent:
+            self._add_load(assignment, -1)
+        assignment.worker = worker
+        if not assignment.is_lent:
+            self._add_load(assignment, 1)
+
+    def _add_load(self, assignment: _Assignment, sign: int) -> None:
+        load = self.loads.get(assignment.worker)
+        if load is None:
+            load = self.loads[assignment.worker] = _Load()
+        load.used += sign * assignment.slots
+        load.seconds += sign * assignment.seconds
+        if assignment.is_nested:
+            load.nested += sign * assignment.slots
+        self.update_worker(assignment.worker)
+
+    # -- held tasks --------------------------------------------------------------------
+
+    def hold(self, task: Any, held: _HeldTask) -> None:
+        """Add a task that waits for a slot."""
+        self.held[task.key] = held
+        self.nested_held += held.bounds.is_nested
+        heap = self.heaps.setdefault(held.client, {}).setdefault(held.bounds, [])
+        self.pushed += 1
+        heapq.heappush(heap, (task.priority, self.pushed, task.key))
+        self.policy.add_waiting(held.client, time.monotonic())
+
+    def release(self, key: Any) -> _HeldTask | None:
+        """Remove a task that no longer waits, and return its entry, if any."""
+        held = self.held.pop(key, None)
+        if held is not None:
+            self.nested_held -= held.bounds.is_nested
+        return held
+
+    def heads(self, client: str) -> Iterator[_HeldTask]:
+        """Iterate over the first task of a client for each kind of bounds, in their order."""
+        heaps = self.heaps.get(client, {})
+        heads: list[tuple[Any, int, _HeldTask]] = []
+        for number, (bounds, heap) in enumerate([*heaps.items()]):
+            while heap:
+                held = self.held.get(heap[0][2])
+                if held is not None and held.client == client and held.bounds == bounds:
+                    heads.append((heap[0][0], number, held))
+                    break
+                heapq.heappop(heap)
+            else:
+                del heaps[bounds]
+        if not heaps:
+            self.heaps.pop(client, None)
+        if len(heads) > 1:
+            heads.sort()
+        return (held for _, _, held in heads)
+
+
+class Shares(SchedulerPlugin):
+    """Scheduler plugin that assigns the tasks of partitions to workers."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.queues: dict[str, PartitionQueue] = {}
+        self.weights: dict[str, float] = {}
+        self._clients: dict[Any, str] = {}  # {task key: name of its client}
+        self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
+        self._numbers = itertools.count()  # numbers of assignments
+        self._check: asyncio.TimerHandle | None = None
+        self._is_dispatch_due = False  # whether a dispatch is scheduled
+        self._rules = MethodRules()
+        scheduler.add_plugin(self)
+
+    def add_partition(self, name: str) -> None:
+        """Hold back tasks of a partition from now on."""
+        if not self.queues:
+            add_holding_rules(
+                self._rules,
+                self.scheduler,
+                choose=self.choose,
+                is_held=self._is_held,
+                admit=self._admit,
+                dispatch=self.dispatch,
+            )
+        queue = self.queues[name] = PartitionQueue(name)
+        for client, weight in self.weights.items():
+            queue.policy.set_weight(client, weight)
+        for worker in workers_declaring(self.scheduler, name):
+            for task in worker.processing:
+                if name in (task.resource_restrictions or ()):
+                    self._start(queue, task, self._client_of(task), worker)
+            queue.update_worker(worker)
+        if self._check is None:
+            self._schedule_check()
+
+    def remove_partition(self, name: str) -> None:
+        """Assign the held tasks of a partition at once, and leave its tasks to Dask."""
+        queue = self.queues.pop(name)
+        assign_held_tasks(self.scheduler, [held.task for held in queue.held.values()])
+        if not self.queues:
+            self._rules.remove_all()
+            self._clients.clear()
+            if self._check is not None:
+                self._check.cancel()
+                self._check = None
+            if not self.weights:
+                self.scheduler.remove_plugin(NAME)
+
+    def set_weight(self, client: str, weight: float) -> None:
+        """Set the weight of a client in all partitions."""
+        self.weights[client] = weight
+        if weight == 1:
+            del self.weights[client]
+        for queue in self.queues.values():
+            queue.policy.set_weight(client, weight)
+
+    # -- clients -----------------------------------------------------------------------
+
+    def update_graph(
+        self, scheduler: Any, *, client: str, tasks: Iterable[Any], **kwargs: Any
+    ) -> None:
+        """Record the client of each new task of a partition."""
+        name = client_name(client)
+        states = scheduler.tasks
+        for key in tasks:
+            task = states[key]
+            resources = task.resource_restrictions
+            if resources and key not in self._clients:
+                submitter = submitter_of(task)
+                self._clients[key] = (
+                    name if submitter is None else self._clients.get(submitter.key, name)
+                )
+
+    def _client_of(self, task: Any) -> str:
+        """Return the client that a task counts for.
+
+        If the client has left, the task counts for another client that wants it.
+        """
+        client = self._clients.get(task.key)
+        if client is not None and (client in self._present() or not task.who_wants):
+            return client
+        wanted_by = sorted(client_name(state.client_key) for state in task.who_wants or ())
+        client = next(iter(wanted_by), client or "")
+        self._clients[task.key] = client
+        return client
+
+    def _present(self) -> Set[str]:
+        if self._present_version != (version := (*self.scheduler.clients,)):
+            self._present_version = version
+            self._present_names = {client_name(client) for client in version}
+        return self._present_names
+
+    _present_version: tuple[str, ...] = ()
+    _present_names: Set[str] = frozenset()
+
+    # -- events of the scheduler -------------------------------------------------------
+
+    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
+        """Update the accounts after a task has ended or no longer waits."""
+        if start == "processing":
+            self._end(key, finish, kwargs)
+        elif start == "no-worker" and finish != "processing":
+            for queue in self.queues.values():
+                if held := queue.release(key):
+                    queue.policy.remove_waiting(held.client)
+        if finish == "forgotten":
+            self._clients.pop(key, None)
+
+    def _end(self, key: Any, finish: str, report: dict[str, Any]) -> None:
+        for queue in self.queues.values():
+            if queue.unassign(key):
+                seconds = None
+                if finish in ("memory", "erred"):
+                    spans = report.get("startstops") or ()
+                    computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
+                    seconds = sum(computing) if computing else None
+                queue.policy.finish(key, time.monotonic(), seconds)
+                if seconds is None:  # Dask may not call `dispatch`, for example after a cancel
+                    self._dispatch_soon()
+
+    def log_event(self, topic: str, msg: Any) -> None:
+        """Record that a task has lent its slots, or has them back."""
+        if topic == LOANS:
+            now = time.monotonic()
+            for queue in self.queues.values():
+                queue.set_lent(msg["key"], msg["lent"])
+                (queue.policy.lend if msg["lent"] else queue.policy.take_back)(msg["key"], now)
+            if msg["lent"]:
+                self._dispatch_soon()
+
+    def _admit(self, worker: Any) -> None:
+        """Assign tasks to a worker that has joined, or has received or lost slots."""
+        for queue in self.queues.values():
+            queue.update_worker(worker)
+        self._dispatch_soon()
+
+    def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
+        """Forget a worker that has left."""
+        for queue in self.queues.values():
+            for state in [state for state in queue.loads if state.address == worker]:
+                queue.forget_worker(state)
+
+    def restart(self, scheduler: Any) -> None:
+        """Forget all tasks after `Client.restart`. Clients keep their weights."""
+        for name in [*self.queues]:
+            self.add_partition(name)
+        self._clients.clear()
+
+    # -- choosing ----------------------------------------------------------------------
+
+    def _is_held(self, task: Any) -> bool:
+        return any(task.key in queue.held for queue in self.queues.values())
+
+    def _queue_of(self, task: Any) -> PartitionQueue | None:
+        resources = task.resource_restrictions
+        if not resources or len(resources) > 1 or task.actor:
+            return None
+        [(name, slots)] = resources.items()
+        return self.queues.get(name) if slots else None
+
+    def choose(self, task: Any) -> Any:
+        """Return the worker of a task, None to hold the task, or NotImplemented to let Dask decide.
+
+        Dask calls this rule whenever a task could be assigned to a worker.
+        """
+        worker = self._chosen.pop(task, None)
+        if worker is not None:
+            return worker
+        queue = self._queue_of(task)
+        if queue is None:
+            return NotImplemented
+        if task.key in queue.held:
+            return None
+        client = self._client_of(task)
+        task.priority = priority_of_waiting(task)
+        bounds = _bounds_of(task)
+        if not queue.held and (worker := self._worker_for(queue, task, bounds)) is not None:
+            self._start(queue, task, client, worker)
+            return worker
+        queue.hold(task, _HeldTask(client, bounds, time.monotonic(), task))
+        if queue.with_room or bounds.is_nested:
+            self._dispatch_soon()
+        return None
+
+    def _start(
+        self,
+        queue: PartitionQueue,
+        task: Any,
+        client: str,
+        worker: Any,
+        held: _HeldTask | None = None,
+        passed_over: Iterable[str] = (),
+    ) -> None:
+        """Charge a client for a task, and add the task to the load of a worker."""
+        slots = task.resource_restrictions[queue.name]
+        now = time.monotonic()
+        if held is None:
+            queue.policy.add_waiting(client, now)
+        charge = queue.policy.start(
+            task.key,
+            client,
+            task.prefix.name,
+            slots,
+            now,
+            0.0 if held is None else now - held.since,
+            [*passed_over],
+        )
+        is_nested = submitter_of(task) is not None
+        seconds = slots * charge.expected_s
+        queue.assign(task.key, _Assignment(worker, slots, seconds, is_nested))
+        task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))
+
+    def _worker_for(self, queue: PartitionQueue, task: Any, bounds: _Bounds) -> Any:
+        """Return a worker that has room for a task, or None."""
+        slots = task.resource_restrictions[queue.name]
+        if bounds.workers is None and bounds.hosts is None:
+            allowed = None
+        else:
+            allowed = self.scheduler.valid_workers(task) or ()
+        if queue.with_room:
+            worker = self._worker_with_room(queue, task, slots, allowed)
+            if worker is not None:
+                return worker
+        return self._worker_for_nested(queue, task, slots, allowed) if bounds.is_nested else None
+
+    def _worker_with_room(
+        self, queue: PartitionQueue, task: Any, slots: float, allowed: Any
+    ) -> Any:
+        holders = holders_of_inputs(task) if task.dependencies else ()
+        if holders and len(holders) <= MAX_HOLDERS:
+            candidates = [
+                worker
+                for worker in holders
+                if worker in queue.with_room and (allowed is None or worker in allowed)
+            ]
+            candidates = [w for w in candidates if can_run(self.scheduler, w, queue.name, slots)]
+            if candidates:
+                return earliest_worker(self.scheduler, task, candidates)
+        free: list[Any] = []
+        others: list[Any] = []
+        for worker in queue.with_room if allowed is None else allowed:
+            if allowed is not None and worker not in queue.with_room:
+                continue
+            if can_run(self.scheduler, worker, queue.name, slots):
+                enough = queue.loads[worker].used + slots <= worker.resources[queue.name]
+                (free if enough else others).append(worker)
+                if len(free) == MAX_COMPARED:
+                    break
+        candidates = free or others[:MAX_COMPARED]
+        if len(candidates) <= 1:
+            return candidates[0] if candidates else None
+        return earliest_worker(self.scheduler, task, candidates)
+
+    def _worker_for_nested(
+        self, queue: PartitionQueue, task: Any, slots: float, allowed: Any
+    ) -> Any:
+        """Return a worker on which a nested task should wait, so that slots are lent to it."""
+        submitter = submitter_of(task)
+        home = self.scheduler.workers.get(submitter.worker) if submitter is not None else None
+        loads = queue.loads
+        if home in loads and (allowed is None or home in allowed):
+            candidates: Iterable[Any] = [home]
+        else:
+            candidates = loads if allowed is None else [w for w in allowed if w in loads]
+        for worker in candidates:
+            if loads[worker].nested < worker.resources.get(queue.name, 0) + 1 and can_run(
+                self.scheduler, worker, queue.name, slots
+            ):
+                return worker
+        return None
+
+    # -- dispatching -------------------------------------------------------------------
+
+    def _dispatch_soon(self) -> None:
+        """Assign tasks after the scheduler has finished its present step."""
+        if not self._is_dispatch_due and any(queue.held for queue in self.queues.values()):
+            self._is_dispatch_due = True
+            asyncio.get_running_loop().call_soon(self._dispatch_due)
+
+    def _dispatch_due(self) -> None:
+        self._is_dispatch_due = False
+        self.dispatch()
+
+    def dispatch(self) -> None:
+        """Assign held tasks to workers with room, as long as there are both."""
+        for queue in self.queues.values():
+            if queue.held and (queue.with_room or queue.nested_held):
+                self._dispatch_from(queue)
+
+    def _dispatch_from(self, queue: PartitionQueue) -> None:
+        chosen: list[Any] = []
+        while queue.held and (queue.with_room or queue.nested_held):
+            found = self._next_task(queue)
+            if found is None:
+                break
+            held, worker, passed_over = found
+            queue.release(held.task.key)
+            self._start(queue, held.task, held.client, worker, held, passed_over)
+            self._chosen[held.task] = worker
+            chosen.append(held.task)
+        if chosen:
+            assign_held_tasks(self.scheduler, chosen)
+            self._chosen.clear()
+
+    def _next_task(self, queue: PartitionQueue) -> tuple[_HeldTask, Any, list[str]] | None:
+        """Return the next task that can be assigned, its worker, and clients passed over."""
+        passed_over: list[str] = []
+        for client in queue.policy.clients_in_turn():
+            if client not in self._present():
+                self._hand_over(queue, client)
+            for held in queue.heads(client):
+                if not (queue.with_room or held.bounds.is_nested):
+                    continue
+                worker = self._worker_for(queue, held.task, held.bounds)
+                if worker is not None:
+                    return held, worker, passed_over
+            passed_over.append(client)
+        return None
+
+    def _hand_over(self, queue: PartitionQueue, client: str) -> None:
+        """Let the tasks of a client that has left count for other clients that want them."""
+        for held in [held for held in queue.held.values() if held.client == client]:
+            other = self._client_of(held.task)
+            if other != client:
+                queue.release(held.task.key)
+                queue.policy.remove_waiting(client)
+                queue.hold(held.task, _HeldTask(other, held.bounds, held.since, held.task))
+
+    # -- checks ------------------------------------------------------------------------
+
+    def _schedule_check(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._check = loop.call_later(CHECK_EVERY_S, self._check_tasks)
+
+    def _check_tasks(self) -> None:
+        """Charge for long tasks, and find tasks that were moved to other workers."""
+        self._schedule_check()
+        now = time.monotonic()
+        tasks = self.scheduler.tasks
+        for queue in self.queues.values():
+            queue.policy.charge_running(now)
+            for key, assignment in queue.assigned.items():
+                task = tasks.get(key)
+                worker = task.processing_on if task is not None else None
+                if worker is not None and worker is not assignment.worker:
+                    queue.move(key, worker)
+            for worker in [*queue.loads]:
+                queue.update_worker(worker)
+            queue.policy.remove_idle(self._present(), now)
+            if queue.loads:  # otherwise, there are no workers
+                refresh_waiting_times(self.scheduler, [held.task for held in queue.held.values()])
+        self._dispatch_soon()
+
+
+def _bounds_of(task: Any) -> _Bounds:
+    is_nested = submitter_of(task) is not None
+    if not (is_nested or task.worker_restrictions or task.host_restrictions):
+        return _ANY_WORKER
+    workers, hosts = task.worker_restrictions, task.host_restrictions
+    return _Bounds(
+        is_nested,
+        frozenset(workers) if workers else None,
+        frozenset(hosts) if hosts else None,
+    )
+
+
+def submitter_of(task: Any) -> SubmittingTask | None:
+    """Return the task that has submitted a nested task, or None."""
+    annotations = task.annotations
+    return annotations.get(SUBMITTER) if annotations else None
+
+
+def client_name(client_id: str) -> str:
+    """Return the name that a client was given, or its ID if it has no name.
+
+    Examples
+    --------
+    >>> client_name("Client-alice-35a2e6b8-cb20-11ef-9d0f-0242ac110002")
+    'alice'
+    """
+    _, _, name = client_id[: -_UUID_LETTERS - 1].partition("-")
+    return name or client_id
+
+
+def shares_of(scheduler: Any) -> Shares:
+    """Return the scheduler's plugin, which is added if necessary.
+
+    Raises
+    ------
+    PoolError
+        If this version of Dask lacks the private API that shares require.
+    """
+    require_feature(SHARES)
+    shares: Shares = scheduler.plugins.get(NAME) or Shares(scheduler)
+    return shares
+
+
+def set_weight(name: str, weight: float, dask_scheduler: Any = None) -> None:
+    """Set the weight of a client in all partitions. Runs on the scheduler."""
+    shares_of(dask_scheduler).set_weight(name, weight)
+
+
+def check_weight(weight: object) -> float:
+    """Return a weight that a user has passed as a float.
+
+    Raises
+    ------
+    PoolError
+        If it is not a positive, finite number.
+    """
+    if isinstance(weight, int | float) and weight is not True and 0 < weight < math.inf:
+        return float(weight)
+    raise PoolError(f"Invalid weight {weight!r}. Expected a positive number, for example 3.")
+
+
+def clients_of(scheduler: Any, name: str) -> dict[str, ClientStats]:
+    """Return the use of a partition by each client, largest share first."""
+    shares: Shares | None = scheduler.plugins.get(NAME)
+    if shares is None or name not in shares.queues:
+        return {}
+    policy = shares.queues[name].policy
+    now = time.monotonic()
+    clients = {
+        client: ClientStats(
+            weight=account.weight,
+            share=policy.share(client, now),
+            slots=int(account.slots),
+            waiting=account.waiting,
+            wait_s=account.recent_wait_s,
+            seconds=account.seconds,
+            queued_seconds=account.waited_s,
+        )
+        for client, account in policy.accounts.items()
+    }
+    return dict(sorted(clients.items(), key=lambda item: -item[1].share))
+
+
+class _Sharing(Feature):
+    """Feature that lets the clients of a partition take turns."""
+
+    def enable(self, scheduler: Any, names: Iterable[str]) -> str:
+        """Share the slots of the given partitions from now on."""
+        try:
+            shares = shares_of(scheduler)
+        except PoolError as error:  # partitions are useful without this feature
+            return f"Clients do not get fair shares. {error}"
+        for name in names:
+            if name not in shares.queues:
+                shares.add_partition(name)
+        return ""
+
+    def disable(self, scheduler: Any, name: str) -> None:
+        """Leave the tasks of a partition to Dask."""
+        shares: Shares | None = scheduler.plugins.get(NAME)
+        if shares is not None and name in shares.queues:
+            shares.remove_partition(name)
+
+    def names(self, scheduler: Any) -> Set[str]:
+        """Return the names of the partitions with shares."""
+        shares: Shares | None = scheduler.plugins.get(NAME)
+        return frozenset() if shares is None else shares.queues.keys()
+
+
+FEATURES.append(_Sharing())

@@ -1,0 +1,219 @@
+"""Clients of a partition take turns, however and how many tasks each of them submits."""
+
+import time
+from collections import Counter
+from contextlib import ExitStack
+
+import dask
+import pytest
+from distributed import Client, Event, wait
+from tests.poolpart.helpers import LONG_S, addresses, kill, metrics_of, wait_for
+
+from poolpart import Partition, Pool, PoolError, rest
+
+ran = []  # names of clients whose tasks have run, in order
+
+
+def run(name, *_):
+    ran.append(name)
+    time.sleep(0.01)
+
+
+@pytest.fixture
+def pair(start):
+    """Partition P with one slot, as seen by the clients alice and bob."""
+    ran.clear()
+    client = start({"w": {"resources": {"P": 1}, "nthreads": 2}})
+    client.cluster.scheduler.validate = True  # Dask checks itself after each step
+    with ExitStack() as stack:
+        names = ("alice", "bob")
+        clients = [stack.enter_context(Client(client.cluster, name=name)) for name in names]
+        yield [Partition("P", client) for client in clients]
+
+
+@pytest.fixture
+def gate(pair):
+    """Occupy the slot until the event is set."""
+    event = Event("gate", pair[0].client)
+    blocker = pair[0].submit(wait_for, "gate", key="blocker")
+    while pair[0].stats().running < 1:
+        time.sleep(0.01)
+    yield event
+    blocker.result(LONG_S)
+
+
+def await_queued(part, number):
+    """Wait until a number of tasks wait for a slot."""
+    while part.stats().queued < number:
+        time.sleep(0.01)
+
+
+def by_submit(part, name, number):
+    return [part.submit(run, name, priority=100) for _ in range(number)]
+
+
+def by_client(part, name, number):
+    return part.as_client().map(run, [name] * number, range(number))
+
+
+def by_compute(part, name, number):
+    tasks = [dask.delayed(run)(name, dask.delayed(abs)(n)) for n in range(number)]
+    return part.compute(tasks)
+
+
+def submit_nested(part, name, number):
+    for future in [part.client.submit(run, name, n) for n in range(number)]:
+        future.result()
+
+
+def by_nested_tasks(part, name, number):
+    return [part.submit(submit_nested, part, name, number)]
+
+
+@pytest.mark.parametrize("way", [by_submit, by_client, by_compute, by_nested_tasks])
+def test_a_second_client_does_not_wait_for_all_tasks_of_the_first(pair, gate, way):
+    alice, bob = pair
+    first = way(alice, "alice", 60)
+    second = by_submit(bob, "bob", 5)
+    await_queued(alice, len({*first, *second}))
+    gate.set()
+    wait([*first, *second], timeout=LONG_S)
+    assert Counter(ran) == {"alice": 60, "bob": 5}
+    last = max(number for number, name in enumerate(ran) if name == "bob")
+    # The assumed and the measured running times of the first tasks differ.
+    assert last < 40, ran
+
+
+def test_a_map_and_each_of_its_items_take_turns_with_other_tasks(pair):
+    alice, bob = pair
+    results = alice.map(run, ["alice"] * 300, chunk=1, window=100)
+    first = by_submit(bob, "bob", 20)
+    wait(first, timeout=LONG_S)
+    assert Counter(ran)["alice"] < 60
+    assert alice.for_each(["alice"] * 5, run) == 5
+    results.close()
+
+
+def test_weights(pair, gate):
+    alice, bob = pair
+    pool = Pool.from_client(alice.client)
+    pool.set_weight("bob", 3)
+    futures = [*by_submit(alice, "alice", 80), *by_submit(bob, "bob", 80)]
+    await_queued(alice, 160)
+    gate.set()
+    wait(futures, timeout=LONG_S)
+    assert 0.6 < Counter(ran[20:80])["bob"] / 60 < 0.9
+    pool.set_weight(bob.client, 1)
+    assert alice.stats().clients["bob"].weight == 1
+
+
+def test_the_priority_orders_the_tasks_of_one_client(pair, gate):
+    alice, bob = pair
+    futures = [alice.submit(run, f"alice {n}", priority=n) for n in range(4)]
+    futures += by_submit(bob, "bob", 1)
+    await_queued(alice, 5)
+    gate.set()
+    wait(futures, timeout=LONG_S)
+    assert [name for name in ran if name != "bob"] == [f"alice {n}" for n in (3, 2, 1, 0)]
+
+
+def test_slots_count(start):
+    ran.clear()
+    client = start({"w": {"resources": {"P": 2}, "nthreads": 2}})
+    with (
+        Client(client.cluster, name="alice") as first,
+        Client(client.cluster, name="bob") as second,
+    ):
+        alice, bob = Partition("P", first), Partition("P", second)
+        gate = Event("gate", first)
+        blocker = alice.submit(wait_for, "gate", slots=2)
+        futures = [alice.submit(run, "alice", slots=2) for _ in range(40)]
+        futures += [bob.submit(run, "bob") for _ in range(80)]
+        await_queued(alice, 120)
+        gate.set()
+        wait([blocker, *futures], timeout=LONG_S)
+    assert Counter(ran[:60])["bob"] > 1.4 * Counter(ran[:60])["alice"]
+
+
+def test_statistics_page_and_metrics_show_shares_and_waits(pair, gate):
+    alice, bob = pair
+    futures = [*by_submit(alice, "alice", 4), *by_submit(bob, "bob", 4)]
+    await_queued(bob, 8)
+    clients = alice.stats().clients
+    assert clients["alice"].slots == 1
+    assert (clients["alice"].waiting, clients["bob"].waiting) == (4, 4)
+    assert "bob" in repr(alice.stats())
+    gate.set()
+    wait(futures, timeout=LONG_S)
+    clients = alice.stats().clients
+    assert sum(client.share for client in clients.values()) == pytest.approx(1)
+    assert clients["bob"].seconds == pytest.approx(0.04, rel=0.9)
+    assert clients["bob"].wait_s > 0
+    metrics = metrics_of(alice.client)
+    assert metrics["client_waiting_tasks", "bob", "P"] == 0
+    assert metrics["client_slot_seconds_total", "bob", "P"] == clients["bob"].seconds
+    assert metrics["client_waiting_seconds_total", "bob", "P"] > 0
+
+
+def test_a_task_that_two_clients_want_stays_when_the_first_leaves(pair, gate, wait_until):
+    alice, bob = pair
+    with Client(alice.client.cluster, name="carol") as client:
+        shared = Partition("P", client).submit(run, "shared", key="shared")
+        wait_until(lambda: "shared" in client.cluster.scheduler.tasks)
+        again = bob.client.submit(run, "shared", key="shared", resources={"P": 1})
+        wait_until(lambda: len(client.cluster.scheduler.tasks["shared"].who_wants) == 2)
+        del shared
+    gate.set()
+    again.result(LONG_S)
+    assert bob.stats().clients.keys() <= {"alice", "bob"}
+
+
+def test_tasks_that_are_cancelled_while_they_wait_are_forgotten(pair, gate):
+    alice, bob = pair
+    futures = by_submit(alice, "alice", 30)
+    await_queued(alice, 30)
+    alice.client.cancel(futures)
+    while alice.stats().clients["alice"].waiting:
+        time.sleep(0.01)
+    future = bob.submit(abs, -1)
+    gate.set()
+    assert future.result(LONG_S) == 1
+    assert not ran
+
+
+def test_tasks_bound_to_a_worker_do_not_delay_others(start):
+    client = start({name: {"resources": {"P": 1}} for name in "ab"})
+    part = Partition("P", client)
+    blocker = part.submit(wait_for, "gate", workers="a")
+    bound = [part.submit(abs, n, workers=addresses(client)["a"]) for n in range(9)]
+    with Client(client.cluster) as other:
+        others = [Partition("P", other).submit(abs, n) for n in range(9)]
+        assert other.gather(others) == [*range(9)]
+    assert not any(future.done() for future in bound)
+    Event("gate", client).set()
+    assert client.gather([*bound, blocker]) == [*range(9), True]
+
+
+@pytest.mark.extended
+def test_workers_that_die_and_a_restart_change_no_shares(nannies):
+    pool = Pool.from_client(nannies)
+    part = pool.divide({"P": rest()})["P"]
+    pool.set_weight(nannies, 2)
+    futures = [part.submit(time.sleep, 0.1) for _ in range(20)]
+    kill(nannies, "0")
+    wait(futures, timeout=LONG_S)
+    nannies.restart()
+    assert part.submit(abs, -1).result(LONG_S) == 1
+    [(name, client)] = part.stats().clients.items()
+    assert name == nannies.id
+    assert (client.weight, client.slots, client.waiting) == (2, 0, 0)
+    pool.set_weight(nannies, 1)
+
+
+@pytest.mark.parametrize("weight", [0, -1, True, "3", float("inf"), float("nan")])
+def test_a_weight_is_a_positive_number(pair, weight):
+    pool = Pool.from_client(pair[0].client)
+    with pytest.raises(PoolError, match=r"Invalid weight .* Expected a positive number"):
+        pool.set_weight("alice", weight)
+    with pytest.raises(PoolError, match="Invalid client ''"):
+        pool.set_weight("", 2)
