@@ -126,7 +126,9 @@ class PartitionQueue:
                 self.with_room.pop(worker, None)
                 return
             load = self.loads[worker] = _Load()
-        if slots and has_room(slots, load.used, load.seconds):
+        # One nested task may wait in addition. Otherwise, nested tasks would keep tasks of other
+        # clients off the worker.
+        if slots and has_room(slots, load.used - min(load.nested, 1), load.seconds):
             self.with_room.setdefault(worker)
         else:
             self.with_room.pop(worker, None)
@@ -533,7 +535,8 @@ class Shares(SchedulerPlugin):
                     continue
                 worker = self._worker_for(queue, held.task, held.bounds)
                 if worker is not None:
-                    return held, worker, passed_over
+                    in_turn = worker in queue.with_room
+                    return held, worker, passed_over if in_turn else []
             passed_over.append(client)
         return None
 
