@@ -204,9 +204,9 @@ def test_tasks_bound_to_a_worker_do_not_delay_others(start):
     with Client(client.cluster) as other:
         others = [Partition("P", other).submit(abs, n) for n in range(9)]
         assert other.gather(others) == [*range(9)]
-    assert not any(future.done() for future in bound)
-    Event("gate", client).set()
-    assert client.gather([*bound, blocker]) == [*range(9), True]
+        assert not any(future.done() for future in bound)
+        Event("gate", client).set()
+        assert client.gather([*bound, blocker]) == [*range(9), True]
 
 
 @pytest.mark.extended
