@@ -50,7 +50,7 @@ from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 COLUMNS = (
     "time", "intensity", "reflectivity", "reflectance", "signal", "range", "azimuth", "elevation",
@@ -711,6 +711,23 @@ def test_parquet_and_ply_are_in_the_world_and_their_columns_fit(tmp_path):
     )
     white = (10 / np.maximum(columns["range"], 1e-9)) ** 2
     np.testing.assert_allclose(columns["reflectance"] * white, columns["intensity"], rtol=2e-3)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(("scanners", "channel"), [(4, 3), (5, 0)])
+def test_the_fifth_scanner_has_no_channel(tmp_path, scanners, channel):
+    _, cloud = flown_alone("sine")
+    sweeps = cloud.sweeps()
+    sides = np.tile([0.0, 0, 0, 1], (scanners, 1))
+    many = replace(
+        sweeps,
+        mounts=SweepPoses(np.arange(3.0 * scanners).reshape(-1, 3), sides),
+        lidars=sweeps.lidars * scanners,
+        sensors=tuple("abcde"[:scanners]),
+        sensor=np.full_like(sweeps.sensor, 3),
+    )
+    las = read_las(replace(cloud, sweeps=lambda: many), tmp_path / "a.laz")
+    assert set(las.scanner_channel) == {channel}
 
 
 def field_rows():

@@ -167,7 +167,8 @@ def _point_fields(sweeps: Sweeps, sweep: int, points: Cloud) -> dict[str, AnyArr
         number, returns = numbers
         fields |= {"returnIndex": number.astype(np.int64) - 1, "returnCount": returns}
     if "time" in columns:
-        fields["timeStamp"] = (points["time"] - sweeps.begins_ns[sweep]) / 1e9
+        # Times are rounded to 1 ns, and the format does not allow negative values.
+        fields["timeStamp"] = np.maximum(points["time"] - sweeps.begins_ns[sweep], 0) / 1e9
     if {*NORMAL} <= columns.keys():
         compensated = sweeps.columns_compensated(sweep, points)
         fields |= {

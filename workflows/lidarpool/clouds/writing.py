@@ -490,7 +490,8 @@ def save_cloud(
 
     The file is written completely or not at all. The same points produce the same bytes, except in
     .rrd files. At most about one million points are held in memory at a time, or all points of the
-    largest sweep if it has more.
+    largest sweep if it has more. Fields of the format whose columns the cloud does not have are 0
+    or omitted, for example the return numbers in .las files.
 
     Parameters
     ----------
