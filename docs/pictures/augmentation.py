@@ -22,8 +22,8 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.weather import Weather
 from lidarsim.scene.actors import box
+from lidarview.color_table import TURBO
 from lidarview.render.camera import Camera
-from lidarview.render.coloring import TURBO
 from lidarview.render.pictures import draw_discs
 
 SIZE = (420, 360)

@@ -21,8 +21,8 @@ from docs.pictures.options import file_parser
 from PIL import Image
 
 from lidarscenes.procedural.city import city
+from lidarview.color_table import TURBO
 from lidarview.render.camera import Camera
-from lidarview.render.coloring import TURBO
 from lidarview.render.pictures import draw_discs
 from lidarview.render.surface import normalize
 

@@ -24,7 +24,8 @@ from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
-from lidarview.render.coloring import TURBO, make_coloring
+from lidarview.color_table import TURBO
+from lidarview.render.coloring import make_coloring
 from lidarview.render.hit_density import hit_density
 from lidarview.render.pictures import draw_cloud, draw_hits, draw_points, draw_scene
 from lidarview.render.shot import GROUND, SKY, take_shot

@@ -12,11 +12,9 @@ from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.colors import pack_colors, unpack_colors
 
+from ..color_table import TURBO
 from .theme import apply_colormap, object_colors
 
-TURBO = apply_colormap(
-    "turbo", np.linspace(0.07, 0.95, 256)
-)  # (256, 3), without its nearly black ends
 DIVERGING = apply_colormap("coolwarm", np.linspace(0, 1, 256))  # (256, 3), pale at the center
 MAX_UNNAMED_LABELS = 12  # more labels without names are shown on a scale
 MAX_COLORS = 1 << 16  # maximum number of distinct label colors

@@ -15,8 +15,9 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.words import plural, remove_common_prefix
 
+from ..color_table import TURBO
 from . import theme
-from .coloring import TURBO, column_values, make_coloring
+from .coloring import column_values, make_coloring
 from .hit_density import hit_colors, hits_title
 from .picture_page import Page, robot_name
 from .shot import SurfaceView

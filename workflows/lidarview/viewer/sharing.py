@@ -30,8 +30,8 @@ from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 
+from ..color_table import TURBO
 from ..picture_file import SensorPositions
-from ..render.coloring import TURBO
 from ..render.film import Film
 from .legends import make_legend
 from .packing import pack_column, pack_positions
