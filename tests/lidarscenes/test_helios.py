@@ -418,7 +418,7 @@ def test_waveform_settings_become_those_of_returns(imported):
         4 / 2.35482
     )
     assert of.visibility_km == pytest.approx(10 * np.log(20) / 3.91)
-    nm = of.mounted_sensors[0].sensor.optics.wavelength_nm
+    nm = of.mounted_sensors[0].sensor.optics.simulated_nm
     assert 1000 * of.extinction_at(nm) == pytest.approx(3.91 / 10 * (nm / 550) ** -1.3)
 
 

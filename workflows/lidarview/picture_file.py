@@ -141,7 +141,7 @@ class PictureContent:
         sensors = sensor_positions(survey)
         positions = [sensor.positions for sensor in sensors]
         drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
-        wavelength_nm = survey.mounted_sensors[0].sensor.optics.wavelength_nm  # the first sensor
+        wavelength_nm = survey.mounted_sensors[0].sensor.optics.simulated_nm  # the first sensor
         kinds = scene.surface_kinds
         materials = MaterialTable.build(survey.materials, kinds, wavelength_nm, scene.has_voxels)
         content = cls(

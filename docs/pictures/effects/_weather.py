@@ -111,7 +111,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     axes.plot(distance, white, color=CURVE, lw=1, ls=":", label="surface of 50 %, clear air")
     attenuated = white * np.exp(-2 * alpha * distance)
     axes.plot(distance, attenuated, color=CURVE, lw=1.4, label="surface of 50 %, here")
-    scatters = survey.backscatter_at(survey.sensor.optics.wavelength_nm)
+    scatters = survey.backscatter_at(survey.sensor.optics.simulated_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
     from_air = survey.air(0).backscatter_energy(scatters, distance - half / 2, distance + half / 2)
     axes.plot(distance, from_air, color=OBJECT_COLORS[1], lw=1.8, label="half a pulse of the air")

@@ -152,7 +152,7 @@ def test_intensities_of_attenuated_returns_are_scaled(clear, sensor):
     (first, *_) = augmented(clear, sensor, weather=weather)
     recorded = clear[0]
     range_m = np.linalg.norm(recorded.points, axis=1)[first.template]  # within 3 cm
-    extinction = weather.extinction_at(sensor.optics.wavelength_nm)
+    extinction = weather.extinction_at(sensor.optics.simulated_nm)
     expected = recorded.columns["intensity"][first.template] * np.exp(-2 * extinction * range_m)
     np.testing.assert_allclose(first.sweep.columns["intensity"], expected, rtol=1e-3)
 

@@ -106,7 +106,7 @@ def test_attenuation_of_hard_targets(visibility_km, recording, sensor):
     kept = np.flatnonzero(result.is_recorded)
     recorded = recording[0].select(result.template[kept])
     range_m = np.linalg.norm(recorded.points, axis=1)
-    extinction = Weather(visibility_km=visibility_km).extinction_at(sensor.optics.wavelength_nm)
+    extinction = Weather(visibility_km=visibility_km).extinction_at(sensor.optics.simulated_nm)
     expected = hard_power(range_m, extinction) / hard_power(range_m, 0.0)
     ratio = result.sweep.columns["intensity"][kept] / recorded.columns["intensity"]
     assert len(kept) > 1000
@@ -125,7 +125,7 @@ def test_range_and_power_of_the_soft_peak(visibility_km, recording, sensor):
     result = augment(recording, sensor, visibility_km)
     added = np.flatnonzero(~result.is_recorded)
     range_m = np.linalg.norm(result.sweep.points[added], axis=1)
-    extinction = Weather(visibility_km=visibility_km).extinction_at(sensor.optics.wavelength_nm)
+    extinction = Weather(visibility_km=visibility_km).extinction_at(sensor.optics.simulated_nm)
     peak_m, peak = soft_peak(extinction)
     assert range_m.mean() == pytest.approx(peak_m, rel=0.05)
     power = result.sweep.columns["intensity"][added].mean()
@@ -139,8 +139,8 @@ def test_power_of_fog_behind_the_peak(visibility_km, sensor):
     survey = Survey(sensor, poses=[(0, 0, 0)], visibility_km=visibility_km)
     edges = np.arange(2, 60) * (LIGHT_M_NS * PULSE_NS / 2)
     edges = edges[edges > 2]
-    backscatter = survey.backscatter_at(sensor.optics.wavelength_nm)
+    backscatter = survey.backscatter_at(sensor.optics.simulated_nm)
     slabs = survey.air(0).backscatter_energy(backscatter, edges[:-1], edges[1:])
-    extinction = survey.extinction_at(sensor.optics.wavelength_nm)
+    extinction = survey.extinction_at(sensor.optics.simulated_nm)
     expected = soft_power((edges[1:] + edges[:-1]) / 2, extinction)
     np.testing.assert_allclose(slabs, expected, rtol=0.02)

@@ -537,7 +537,7 @@ class _Building:
             return None
         some = even_indices(len(built.parts), _RESPONSE_SUBMAPS).tolist()
         observations = [self._load_observations(index) for index in some]
-        wavelength_nm = model.optics.wavelength_nm
+        wavelength_nm = model.optics.simulated_nm
         return found | {"visibility_m": estimate_visibility(observations, wavelength_nm)}
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:

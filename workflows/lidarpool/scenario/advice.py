@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.columns.table import VELOCITY
-from lidarsim.media.materials import MaterialTable
+from lidarsim.media.materials import FAR_NM, NEAR_NM, MaterialTable, reflectances
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.navigation import Gnss, Imu
@@ -23,7 +23,7 @@ from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
-from lidarsim.words import format_as_scenario, format_rounded, list_names, plural
+from lidarsim.words import format_as_scenario, format_rounded, join_names, list_names, plural
 
 from .georeference import missing_epsg_note
 from .prepare import PreparedScenario
@@ -69,7 +69,11 @@ def advice(prepared: PreparedScenario) -> list[str]:
     if any(column.name == "class" for column in prepared.survey.stored_columns):
         labels = chain(unlabeled_notes(prepared.scene, prepared.survey), labels)
     settings = (*coarse, *_format_notes(prepared), *labels, *_without_effect(prepared.scenario))
-    light = (*_single_returns(prepared), *_dark_fog(prepared.survey))
+    light = (
+        *_single_returns(prepared),
+        *_dark_fog(prepared.survey),
+        *_assumed_wavelengths(prepared),
+    )
     groups = (
         *(notes, axes, likely, _heading_notes(prepared.findings.without_angles)),
         *(settings, light, _timing_notes(prepared)),
@@ -321,6 +325,29 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
             f"`noise.detection_range_m`{of_sensors} is not set. Set it to the range at 10 % "
             "reflectance, for example `noise: {detection_range_m: 90}`"
         )
+
+
+def _assumed_wavelengths(prepared: PreparedScenario) -> Iterator[str]:
+    """Yield a note if reflectances depend on a wavelength that no source of a sensor states."""
+    survey = prepared.survey
+    sections = prepared.scenario.sensors.values() or (prepared.scenario.sensor,)
+    models = dict.fromkeys(
+        carried.sensor.model
+        for section, carried in zip(sections, survey.mounted_sensors, strict=True)
+        if (section.model or section.calibration) and carried.sensor.optics.wavelength_nm is None
+    )
+    spectra = {entry.spectrum for entry in survey.materials if entry.spectrum is not None}
+    shares = {name: reflectances()[name].shares for name in sorted(spectra)}
+    if not models or all(near == far for near, far in shares.values()):
+        return
+    name = max(shares, key=lambda name: abs(shares[name][0] - shares[name][1]))
+    near, far = shares[name]
+    yield (
+        f"the wavelength of {join_names([*models])} is unknown and simulated as {NEAR_NM:g} nm, "
+        f"but reflectances depend on it: the spectrum {name!r} is {near:.2f} at {NEAR_NM:g} nm and "
+        f"{far:.2f} at {FAR_NM:g} nm. If you know the wavelength, set `optics.wavelength_nm` in a "
+        "copy of the sensor file"
+    )
 
 
 def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:

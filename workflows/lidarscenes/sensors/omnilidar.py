@@ -55,7 +55,7 @@ _WITHOUT_EFFECT = {
     "rotationDirection": None,
     "stateResolutionStep": 1,
     "validEndAzimuthDeg": 360,
-    "waveLengthNm": Optics().wavelength_nm,  # default of scenarios
+    "waveLengthNm": Optics().simulated_nm,  # default of scenarios
 }
 _AZIMUTH_TOLERANCE_DEG = 1e-4  # angles are float32
 

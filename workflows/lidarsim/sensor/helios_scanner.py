@@ -126,7 +126,7 @@ def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
     numbers: dict[str, float] = {
         "pulseFreqs_Hz": scanner.pulse_hz,
         "pulseLength_ns": optics.pulse_ns,
-        "wavelength_nm": round(optics.wavelength_nm),
+        "wavelength_nm": round(optics.simulated_nm),
         "beamDivergence_rad": 1e-3 * _divergence_mrad(sensor),
         "accuracy_m": 0.0 if sensor.noise is None else sensor.noise.range_m,
         "rangeMin_m": sensor.min_range_m,
@@ -205,7 +205,9 @@ def _lost_light(sensor: Sensor) -> Iterable[str]:
             "the two divergences of an elliptical beam (written as a round beam with "
             "their geometric mean)"
         )
-    if sensor.optics.wavelength_nm % 1:
+    if sensor.optics.wavelength_nm is None:
+        yield f"an unknown wavelength (written as {sensor.optics.simulated_nm:g} nm)"
+    if sensor.optics.simulated_nm % 1:
         yield "fractions of a nanometer of the wavelength"
     if sensor.noise is not None and replace(sensor.noise, range_m=0.0, seed=0) != Noise():
         yield "noise other than range noise"

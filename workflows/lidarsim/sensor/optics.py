@@ -38,6 +38,7 @@ SINGLE_RETURN: tuple[Mode, ...] = ("strongest", "first", "last")  # modes with o
 TWO_RETURNS: tuple[Mode, ...] = ("dual", "two_strongest")  # modes with at most two returns
 
 
+_USUAL_NM = 905.0  # wavelength of most lidars
 AngleMrad = Annotated[float, Field(ge=0, le=1000)]
 # Full cone angle of a beam at 1/e² of the maximum, or a horizontal and a vertical angle.
 Divergence = Annotated[
@@ -45,6 +46,7 @@ Divergence = Annotated[
     describe_allowed("from 0 to 1000, or two such numbers as [horizontal, vertical]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
+Wavelength = Annotated[float, Field(ge=200, le=20_000)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
 Precision = Annotated[float, Field(ge=1e-6, le=1000)]
 
@@ -54,8 +56,9 @@ class Optics(FileSection):
     """Optical parameters and range resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, about("wavelength of the laser in nanometers; 905 if unknown", ge=200, le=20_000)
-    ] = 905.0
+        Wavelength | None,
+        about("wavelength of the laser in nanometers; None if unknown, which is simulated as 905"),
+    ] = None
     divergence_mrad: Annotated[
         Divergence | None,
         about(
@@ -94,6 +97,11 @@ class Optics(FileSection):
         check_fields(self)
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
+
+    @property
+    def simulated_nm(self) -> float:
+        """Wavelength of the simulated light in nanometers, which is 905 if it is unknown."""
+        return _USUAL_NM if self.wavelength_nm is None else self.wavelength_nm
 
 
 @dataclass(frozen=True)

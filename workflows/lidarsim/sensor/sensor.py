@@ -134,7 +134,8 @@ class Sensor:
             "rate": self._rate(),
             "range": f"from {self.min_range_m:g} m"
             + (f" to {self.max_range_m:g} m" if self.max_range_m < float("inf") else ""),
-            "wavelength": f"{self.optics.wavelength_nm:g} nm",
+            "wavelength": f"{self.optics.simulated_nm:g} nm"
+            + " (assumed)" * (self.optics.wavelength_nm is None),
         }
         return html_table(rows.items()) + html_picture(self)
 

@@ -21,7 +21,7 @@ FRAME_HZ = 10.0  # assumed for lists that state neither times nor a rate
 class Light(NamedTuple):
     """Optical properties of a sensor's light."""
 
-    wavelength_nm: float
+    wavelength_nm: float | None  # None if unknown
     pulse_ns: float
     # Full horizontal and vertical angles at 1/e² of the maximum; None if unknown.
     divergence_mrad: tuple[float, float] | None

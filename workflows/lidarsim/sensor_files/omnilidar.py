@@ -128,7 +128,7 @@ def _settings(rays: RayList, frames: Sequence[Ints]) -> Iterator[str]:
     yield f"float {CORE}nearRangeM = {min_range_m:.9g}"
     if isfinite(max_range_m):
         yield f"float {CORE}farRangeM = {max_range_m:.9g}"
-    if rays.light is not None:
+    if rays.light is not None and rays.light.wavelength_nm is not None:
         yield f"float {CORE}waveLengthNm = {rays.light.wavelength_nm:.9g}"
 
 

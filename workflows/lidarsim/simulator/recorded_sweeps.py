@@ -178,7 +178,7 @@ class PulseAugmenter:
             **options,
         )
         self.surfaces = SceneSurfaces(
-            scene, tuple(self.survey.materials), [sensor.optics.wavelength_nm]
+            scene, tuple(self.survey.materials), [sensor.optics.simulated_nm]
         )
         (caster,) = casters_of_sensors(scene, self.survey, self.surfaces)
         self._caster = caster

@@ -97,7 +97,7 @@ class Rig:
         self.survey = survey
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
-        wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.mounted_sensors}
+        wavelengths = {carried.sensor.optics.simulated_nm for carried in survey.mounted_sensors}
         # These parts are public so that other tools can inspect them.
         self.surfaces = SceneSurfaces(scene, tuple(survey.materials), sorted(wavelengths))
         # Casters by sensor number.

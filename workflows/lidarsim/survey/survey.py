@@ -580,7 +580,7 @@ class Survey(CloudOptions, Weather):
 
     def extinction(self, sensor: Sensor) -> float:
         """Return the extinction coefficient of the air at a sensor's wavelength, in 1/m."""
-        return self.extinction_at(sensor.optics.wavelength_nm)
+        return self.extinction_at(sensor.optics.simulated_nm)
 
     def air(self, number: int) -> Air:
         """Return the properties of the air for the sensor with the given index."""
@@ -588,7 +588,7 @@ class Survey(CloudOptions, Weather):
         divergence = self.returns_each[number].divergence(optics)
         overlap_m = self.noise_each[number].overlap_m
         exit_m = self.returns_each[number].exit_m(optics) or EXIT_M
-        return Air(self.extinction_at(optics.wavelength_nm), exit_m, divergence, overlap_m)
+        return Air(self.extinction_at(optics.simulated_nm), exit_m, divergence, overlap_m)
 
     def mean_particles(self, number: int) -> float:
         """Return the mean number of drops and flakes per pulse that can cause a return."""

@@ -58,7 +58,7 @@ def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
 
     All values are floats, because an int would cause the compiled loops to be compiled again.
     """
-    return SensorLight(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
+    return SensorLight(sensor.optics.simulated_nm, survey.extinction(sensor), float(survey.wet))
 
 
 def warn_of_gray(scene: Scene, survey: Survey) -> None:

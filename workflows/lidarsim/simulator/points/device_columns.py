@@ -61,7 +61,7 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     """Return the names of the columns that a device can compute for a survey in a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.mounted_sensors)
     several_wavelengths = (
-        len({carried.sensor.optics.wavelength_nm for carried in survey.mounted_sensors}) > 1
+        len({carried.sensor.optics.simulated_nm for carried in survey.mounted_sensors}) > 1
     )
     textured_or_rough = any(
         m.reflectance == "texture"

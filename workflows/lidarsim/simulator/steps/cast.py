@@ -225,7 +225,7 @@ class CastStep(PulseStep):
         sensor = setup.sensor
         self._sensor_light = sensor_light_of(survey, sensor)
         self._seed = setup.noise.seed
-        table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(sensor.optics.simulated_nm)
         filled = table.leafy.any() or table.refracts.any()
         air = self._sensor_light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None

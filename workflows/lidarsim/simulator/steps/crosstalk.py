@@ -117,11 +117,11 @@ class CrosstalkStep(PulseStep):
         self._sensor = setup.sensor
         divergence = setup.reporting.divergence(self._sensor.optics)
         self._cosine = sin_cos_of(divergence / 2)[1]  # cosine of half a ray's field of view
-        nm = self._sensor.optics.wavelength_nm
+        nm = self._sensor.optics.simulated_nm
         self._other_sensors = [
             number
             for number, carried in enumerate(self._survey.mounted_sensors)
-            if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
+            if number != setup.number and abs(carried.sensor.optics.simulated_nm - nm) <= FILTER_NM
         ]
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
@@ -333,7 +333,7 @@ class CrosstalkStep(PulseStep):
         # Optical depth of the air from the other sensor to the spot and on to the receiver.
         air_depth = self._survey.extinction(self._sensor) * (spots.distance[spot] + path_m)
         kinds = surfaces.kinds(triangle)
-        table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
+        table = surfaces.at_wavelength(self._sensor.optics.simulated_nm)
         # A retroreflector returns light only to the sensor that emitted it.
         share = table.reflectance[kinds] * ~table.retro[kinds]
         return np.asarray(share * cosine * normal_incidence_energy(path_m) * exp(-air_depth))

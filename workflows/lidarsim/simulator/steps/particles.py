@@ -110,7 +110,7 @@ class WeatherStep(PulseStep):
         noise = setup.noise
         survey = setup.survey
         self._seed = noise.seed
-        self._wavelength_nm = sensor.optics.wavelength_nm
+        self._wavelength_nm = sensor.optics.simulated_nm
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
         min_range_m, max_range_m = particle_range(sensor.min_range_m, sensor.max_range_m)
@@ -137,7 +137,7 @@ class WeatherStep(PulseStep):
     @staticmethod
     def added_returns(setup: Setup) -> float:
         """Return the mean number of particle and fog returns per pulse."""
-        backscatter = setup.survey.backscatter_at(setup.sensor.optics.wavelength_nm)
+        backscatter = setup.survey.backscatter_at(setup.sensor.optics.simulated_nm)
         return setup.survey.mean_particles(setup.number) + bool(backscatter)
 
     @staticmethod

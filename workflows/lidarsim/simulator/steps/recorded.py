@@ -31,7 +31,7 @@ class RecordedStep(PulseStep):
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
         self._extinction = sensor_light_of(setup.survey, setup.sensor).extinction
-        self._materials = surfaces.at_wavelength(setup.sensor.optics.wavelength_nm)
+        self._materials = surfaces.at_wavelength(setup.sensor.optics.simulated_nm)
 
     @staticmethod
     def applies(setup: Setup) -> bool:

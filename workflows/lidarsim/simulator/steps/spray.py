@@ -88,7 +88,7 @@ class SprayStep(PulseStep):
         self._clump_distribution = seen_by_range(
             air, clump_kind, FAINTEST * noise.threshold, *range_limits_m
         )
-        self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
+        self._materials = surfaces.at_wavelength(sensor.optics.simulated_nm)
         # (actors, 2, 3), in meters in the actor frame: lowest corner of each mesh's bounding box,
         # and half of the box's side lengths.
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
