@@ -22,6 +22,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    compare,
     compare_strips,
     compare_surveys,
 )
@@ -565,6 +566,69 @@ def write_las(path, points, sources=None, epsg=None):
         data.point_source_id = sources
     data.write(path)
     return path
+
+
+def in_result(path, points, origin):
+    """Write points to the folder of a result with a world origin."""
+    path.mkdir()
+    (path / "report.json").write_text(json.dumps({"parameters": {"world_origin": [*origin]}}))
+    return write_las(path / "cloud.las", points)
+
+
+@pytest.mark.parametrize("placed", ["a", "b"])
+@pytest.mark.parametrize("method", ["pairs", "planes", "strips", "sweeps"])
+def test_the_world_origin_of_a_result_is_added_to_local_coordinates(tmp_path, placed, method):
+    local = plane(900, tilt_deg=4) - ORIGIN
+    points = {"a": local + SHIFT, "b": local}
+    files = {
+        key: in_result(tmp_path / key, points[key] + ORIGIN, ORIGIN)
+        if key == placed
+        else write_las(tmp_path / "local.las", points[key])
+        for key in "ab"
+    }
+    note = (
+        rf"the world origin of .*{placed}.cloud\.las, \(500000, 5800000, 100\) m, is added to the "
+        r"coordinates of .*local\.las$"
+    )
+    if method == "sweeps":
+        found = compare(files["a"], files["b"])
+        assert found.figures["distances"]["a_to_b"]["max_m"] < 0.07
+    elif method == "strips":
+        found = compare_strips(files["a"], files["b"], cell_m=4)
+        height = SHIFT[2] - np.tan(np.radians(4)) * SHIFT[0]
+        assert components(found, "delta_h")["mean_m"] == pytest.approx(height, abs=1e-4)
+    else:
+        found = compare_surveys(files["a"], files["b"], method=method)
+        heights = components(found, "delta_h" if method == "pairs" else "distance")
+        assert heights["mean_m"] == pytest.approx(0.05, abs=0.003)
+    assert any(re.match(note, text) for text in found.figures["notes"])
+
+
+def test_the_world_origin_is_not_added_to_world_coordinates(tmp_path):
+    points = plane(900)
+    a = in_result(tmp_path / "a", points, (3.0, -4.0, 0.0))
+    found = compare_surveys(a, write_las(tmp_path / "b.las", points + SHIFT), method="pairs")
+    assert components(found, "delta_h")["mean_m"] == pytest.approx(-0.05, abs=1e-4)
+    assert not any("world origin" in note for note in found.figures["notes"])
+    both = in_result(tmp_path / "b", points, (3.0, -4.0, 0.0))
+    assert not any("world origin" in note for note in compare_surveys(a, both).figures["notes"])
+
+
+@pytest.mark.parametrize("name", ["scene.glb", "scene.ply"])
+def test_a_mesh_in_local_coordinates_is_moved_to_the_world_origin(tmp_path, name):
+    corners = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0]], float)
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / name)
+    a = in_result(tmp_path / "a", plane(500, height=-0.04), ORIGIN)
+    found = compare_surveys(a, tmp_path / name, method="mesh", up_axis="z")
+    one = components(found, "distance")
+    assert one["count"] == 500
+    assert one["mean_m"] == pytest.approx(-0.04, abs=1e-4) and one["std_m"] < 1e-4
+    assert np.allclose(found.points.mean(axis=0), plane(500).mean(axis=0) - (0, 0, 0.04), atol=1e-3)
+    start = f"the world origin of {a}, (500000, 5800000, 100) m, is added"
+    assert any(note.startswith(start) for note in found.figures["notes"])
+    (tmp_path / "a" / "report.json").unlink()
+    with pytest.raises(LidarError, match=r"The nearest point is 5,\d\d\d,\d\d\d\.\d+ m away"):
+        compare_surveys(a, tmp_path / name, method="mesh")
 
 
 def test_different_coordinate_systems_are_refused(tmp_path):

@@ -133,11 +133,13 @@ class WrittenLines:
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
-        self._started = time.monotonic()
+        self._started: float | None = None  # time of the first call
         self._next = PLAIN_EVERY_S[0]  # elapsed time in seconds at which the next line is due
 
     def __call__(self, name: str, completed: int, total: int, unit: str) -> None:
         """Print a line if enough time has passed since the last one."""
+        if self._started is None:
+            self._started = time.monotonic()
         elapsed_s = time.monotonic() - self._started
         if elapsed_s >= self._next and completed < total:
             min_s, max_s = PLAIN_EVERY_S

@@ -143,6 +143,9 @@ class Recording:
         Coordinate system that the file declares.
     epsg
         EPSG code of the coordinates, or None if they are not in a known system with the unit meter.
+    world_origin
+        Position of the local zero point in world coordinates, in meters, which lidarpool has added
+        to the points of a result. Shape (3,). None if nothing was added, or if it is unknown.
     is_metric
         Whether the format defines coordinates as true meters, regardless of the coordinate system.
     sequence
@@ -186,6 +189,7 @@ class Recording:
     meters: Meters = METERS
     system: StatedSystem | None = None
     epsg: int | None = None
+    world_origin: Floats | None = None
     is_metric: bool = False
     sequence: str = ""
     calibration: Path | None = None

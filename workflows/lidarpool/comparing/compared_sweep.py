@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
 from ..clouds.recording import Recording
@@ -45,6 +48,59 @@ def compared_in_world(recording: Recording, number: int) -> Sweep:
             "sensor. Compare it with a recording that consists of sweeps."
         )
     return sweep.replace(points=sweep.in_world())
+
+
+def bounds_of(points: Floats) -> Floats:
+    """Return the bounding box of points, of shape (2, 3)."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def separation_m(a: Floats, b: Floats) -> float:
+    """Return the largest distance between two bounding boxes along an axis, in meters.
+
+    It is negative if they overlap. The boxes have shape (2, 3).
+    """
+    return float(np.maximum(a[0] - b[1], b[0] - a[1]).max())
+
+
+def origin_to_add(origins: Sequence[Floats | None], bounds: Sequence[Floats]) -> OriginShift | None:
+    """Return the world origin to add to one of two clouds, or None if they are in the same frame.
+
+    Results with a world origin are in world coordinates, but their scene and results without this
+    origin are in local coordinates. The origin of one cloud is added to the other one if they are
+    apart without it and closer to each other with it.
+
+    Parameters
+    ----------
+    origins
+        World origins of both clouds, or None.
+    bounds
+        Bounding boxes of both clouds, of shape (2, 3), in meters.
+    """
+    apart_m = separation_m(*bounds)
+    for placed, local in ((0, 1), (1, 0)):
+        origin = origins[placed]
+        if origin is None or origins[local] is not None or apart_m <= 0:
+            continue
+        if separation_m(bounds[placed], bounds[local] + origin) < apart_m:
+            return OriginShift(local, placed, origin)
+    return None
+
+
+class OriginShift(NamedTuple):
+    """World origin of a cloud that is added to the points of another one."""
+
+    local: int  # index of the cloud in local coordinates
+    placed: int  # index of the cloud in world coordinates
+    origin: Floats  # (3,), meters
+
+    def note(self, names: Sequence[str]) -> str:
+        """Return a note for the user."""
+        origin = ", ".join(f"{value:.10g}" for value in self.origin)
+        return (
+            f"the world origin of {names[self.placed]}, ({origin}) m, is added to the coordinates "
+            f"of {names[self.local]}"
+        )
 
 
 def check_reach(recording: Recording, sweep: Sweep) -> None:

@@ -27,7 +27,7 @@ from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..open3d_access.neighbors import nearest_neighbors
 from ..recordings.opening import open_recording
-from .compared_sweep import compared_in_world, compared_sweep, rings_note
+from .compared_sweep import bounds_of, compared_in_world, compared_sweep, origin_to_add, rings_note
 from .comparison import CELLS, RESIDUALS, Comparison
 from .lidar4d import PROTOCOL, FrameCollector
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
@@ -159,6 +159,7 @@ def compare(
     )
     points_a = comparing.read_cloud(first, max_points)
     points_b = comparing.read_cloud(second, max_points)
+    points_a, points_b = comparing.with_world_origin(points_a, points_b)
     if max(len(points_a), len(points_b)) > MAX_VALUES:
         comparing.add_note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
@@ -325,6 +326,18 @@ class _Comparing:
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
         return Sweep.concatenate(parts)
+
+    def with_world_origin(self, *clouds: Sweep) -> list[Sweep]:
+        """Add the world origin of one recording to the points of the other, if these are local."""
+        shifted = [*clouds]
+        if all(map(len, clouds)):
+            origins = [recording.world_origin for recording in self.recordings]
+            bounds = [bounds_of(cloud.points) for cloud in clouds]
+            if (shift := origin_to_add(origins, bounds)) is not None:
+                local = clouds[shift.local]
+                shifted[shift.local] = local.replace(points=local.points + shift.origin)
+                self.add_note(shift.note([recording.name for recording in self.recordings]))
+        return shifted
 
     def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
         """Compare two sweeps in sensor coordinates.

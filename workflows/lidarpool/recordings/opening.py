@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError, MissingFileError
+from lidarsim.io.input_files import read_input
+from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
@@ -130,7 +135,19 @@ def open_recording(
             f"{join_names(_UNIT_SUFFIXES)} files."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
+    recording = replace(recording, world_origin=_world_origin(path))
     return replace(recording, noise_classes=None) if keep_noise else recording
+
+
+def _world_origin(path: Path) -> Floats | None:
+    """Return the origin that was added to the points of a result, or None if nothing was added."""
+    folder = path if path.is_dir() else path.parent
+    try:
+        report = json.loads(read_input(folder / "report.json"))
+        origin = np.array(report["parameters"]["world_origin"], np.float64)
+    except (OSError, ValueError, TypeError, LookupError, LidarError):
+        return None
+    return origin if origin.shape == (3,) and origin.any() else None
 
 
 def _open_path(source: RecordingSource) -> Recording:

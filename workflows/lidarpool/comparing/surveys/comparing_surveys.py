@@ -18,7 +18,13 @@ from .mesh import is_mesh, mesh_deviations
 from .pairs import UnpairedError, pair_deviations
 from .planes import neighborhood_radius, plane_deviations
 from .strips import StripSettings, strip_deviations
-from .survey_clouds import CloudSource, SurveyCloud, check_overlap, check_same_frame
+from .survey_clouds import (
+    CloudSource,
+    SurveyCloud,
+    add_world_origin,
+    check_overlap,
+    check_same_frame,
+)
 from .survey_comparison import SurveyComparison
 
 METHODS = ("auto", "pairs", "planes", "m3c2", "mesh")
@@ -127,6 +133,8 @@ def compare_surveys(
         return _compare_with_mesh(first, Path(b), reach_m, unit=unit_b, up_axis=up_axis)
     second = SurveyCloud.open(b, "cloud B", sensor=sensor_b, unit=unit_b, **common)
     notes = check_same_frame([first, second])
+    (first, second), more = add_world_origin([first, second])
+    notes += more
     if method in {"auto", "pairs"}:
         try:
             found = pair_deviations(first, second, max_points)
@@ -194,6 +202,8 @@ def compare_strips(
     if not opened:
         raise LidarError("There is no cloud to compare. Specify at least one.")
     notes = check_same_frame(opened)
+    opened, more = add_world_origin(opened)
+    notes += more
     found = strip_deviations(opened, StripSettings(cell_m, max_roughness_m))
     return _summarize("strips", opened, found, notes)
 
@@ -239,7 +249,8 @@ def _compare_with_mesh(
 ) -> SurveyComparison:
     points, notes = a.sample(_MAX_COMPARED)
     chosen = {name: value for name, value in options.items() if value is not None}
-    found = mesh_deviations(points.positions, mesh, reach_m, **chosen)
+    placed = a.name, a.world_origin
+    found = mesh_deviations(points.positions, mesh, reach_m, placed, **chosen)
     found.figures["points"] = {"a": len(points)}
     return _summarize("mesh", [a], found, notes, str(mesh))
 

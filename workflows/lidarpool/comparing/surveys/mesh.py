@@ -15,6 +15,7 @@ from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_instances import SceneInstance
 
 from ...open3d_access.open3d_module import load_open3d
+from ..compared_sweep import bounds_of, origin_to_add
 from .deviations import Deviations
 
 _BATCH = 200_000
@@ -34,7 +35,11 @@ def is_mesh(path: Path) -> bool:
 
 
 def mesh_deviations(
-    points: Floats, mesh: Path, max_distance_m: float, **options: Any
+    points: Floats,
+    mesh: Path,
+    max_distance_m: float,
+    placed: tuple[str, Floats | None] = ("the points", None),
+    **options: Any,
 ) -> Deviations:
     """Return the signed distances from points to the nearest triangles of a mesh.
 
@@ -49,11 +54,18 @@ def mesh_deviations(
         Mesh file.
     max_distance_m
         Points farther than this from the mesh have no counterpart.
+    placed
+        Name of the points, and the world origin that they contain, if any. It is added to a mesh in
+        local coordinates.
     options
         `unit` and `up_axis` of the mesh.
     """
     notes: list[str] = []
     corners = _triangles(mesh, notes, options)
+    boxes = bounds_of(points), bounds_of(corners.reshape(-1, 3))
+    if (shift := origin_to_add((placed[1], None), boxes)) is not None:
+        corners = corners + shift.origin
+        notes.append(shift.note((placed[0], str(mesh))))
     origin = corners.reshape(-1, 3).mean(axis=0)
     is_closed = _is_closed(corners)
     surface = _Surface(corners - origin, is_closed)
@@ -65,9 +77,11 @@ def mesh_deviations(
     )
     near = np.abs(distances) <= max_distance_m
     if not near.any():
+        nearest_m = float(np.abs(distances).min())
         raise LidarError(
-            f"None of the points is within {max_distance_m:g} m of {mesh}. Check its unit and "
-            "axes, or increase `--max-distance`."
+            f"None of the points is within {max_distance_m:g} m of {mesh}. The nearest point is "
+            f"{nearest_m:,.3f} m away. Check the unit, axes and origin of the mesh, or increase "
+            "`--max-distance`."
         )
     if not is_closed:
         notes.append(

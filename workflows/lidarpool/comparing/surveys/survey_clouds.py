@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from lidarsim.schema.vocabulary import UNITS_M
 from ...clouds.recording import Recording, SeveralSensorsError
 from ...columns.parts import StoredCloud
 from ...recordings.opening import open_recording
-from ..compared_sweep import check_reach
+from ..compared_sweep import bounds_of, check_reach, origin_to_add, separation_m
 
 CloudSource = str | Path | Cloud | StoredCloud
 UNKNOWN = -1  # index of an unknown scanner
@@ -69,6 +69,7 @@ class SurveyCloud:
     recordings: tuple[Recording, ...]  # one per sensor
     unit: str | None  # unit that the user chose
     show: WritingProgress = lambda *_: None  # called when a part has been read
+    shift_m: Floats | None = None  # (3,): world origin that is added to all points, if any
 
     @classmethod
     def open(
@@ -135,6 +136,11 @@ class SurveyCloud:
         return system.vertical_datum
 
     @property
+    def world_origin(self) -> Floats | None:
+        """World origin that is contained in the points, or None."""
+        return self.recordings[0].world_origin
+
+    @property
     def unit_name(self) -> str:
         """Name of the length unit of the file."""
         meters = self.recordings[0].meters[0]
@@ -159,7 +165,8 @@ class SurveyCloud:
                 part = _world_points(recording, index, with_ranges=with_ranges)
                 if len(part):
                     sensor = np.full(len(part), number, np.int64)
-                    yield part.replace(columns={**part.columns, SENSOR: sensor})
+                    part = part.replace(columns={**part.columns, SENSOR: sensor})
+                    yield part if self.shift_m is None else _shifted(part, self.shift_m)
 
     def sample(self, max_points: int) -> tuple[SurveyPoints, list[str]]:
         """Read points, sampled evenly if there are more than about `max_points`.
@@ -226,6 +233,31 @@ def _world_points(recording: Recording, number: int, *, with_ranges: bool) -> Sw
     return sweep.replace(points=points, columns=columns, scanner=scanner)
 
 
+def _shifted(part: Sweep, shift_m: Floats) -> Sweep:
+    scanner = None if part.scanner is None else part.scanner + shift_m
+    return part.replace(points=part.points + shift_m, scanner=scanner)
+
+
+def add_world_origin(clouds: Sequence[SurveyCloud]) -> tuple[list[SurveyCloud], list[str]]:
+    """Transform clouds in the local coordinates of a scene, if another one is in world coordinates.
+
+    Returns the clouds, and notes that name the origin.
+    """
+    placed = next((cloud for cloud in clouds if cloud.world_origin is not None), None)
+    found, notes = [], []
+    for cloud in clouds:
+        moved = cloud
+        if placed is not None and cloud.world_origin is None:
+            first_parts = [next(one.parts(), None) for one in (placed, cloud)]
+            bounds = [bounds_of(part.points) for part in first_parts if part is not None]
+            shift = origin_to_add((placed.world_origin, None), bounds) if len(bounds) > 1 else None
+            if shift is not None:
+                moved = replace(cloud, shift_m=shift.origin)
+                notes.append(shift.note((placed.name, cloud.name)))
+        found.append(moved)
+    return found, notes
+
+
 def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
     """Raise LidarError if clouds state different coordinate systems or units.
 
@@ -289,7 +321,7 @@ def _is_same_system(a: SurveyCloud, b: SurveyCloud) -> bool:
 
 def check_overlap(a: Floats, b: Floats, names: tuple[str, str], margin_m: float) -> None:
     """Raise LidarError if the extents of two clouds are farther apart than a margin in meters."""
-    gap = np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0)).max()
+    gap = separation_m(bounds_of(a), bounds_of(b))
     if gap > margin_m:
         raise LidarError(
             f"The extents of {names[0]} and {names[1]} are {gap:,.3f} m apart, so there is nothing "
