@@ -17,7 +17,8 @@ class LeadTime:
     A client that computes between results, or that runs on a busy machine, sends the next tasks
     late. The lead time covers this delay. It doubles if both the slots and the client were idle for
     more than 10 % of the time over a whole window of tasks. If the client never waits, it is slower
-    than the workers, and more tasks in flight would not help.
+    than the workers, and more tasks in flight would not help. The same applies if the slots were
+    busy with tasks of others, which only the scheduler knows.
 
     Examples
     --------
@@ -55,14 +56,27 @@ class LeadTime:
         """Record for how many seconds the client has waited for tasks."""
         self._waited_s += seconds
 
-    def review(self, window: int) -> None:
-        """Double the lead time if client and slots were idle during the last `window` tasks."""
+    def is_short(self, window: int) -> bool:
+        """Return whether the lead time may be too short, after each `window` tasks.
+
+        This is the case if the client was idle, and the slots had too few tasks of this map.
+        """
         if self._tasks < window:
-            return
+            return False
         elapsed_s = time.monotonic() - self._since
         # In a chain of maps, the partition with the most work limits the rate.
         idle_s = elapsed_s - max(self._busy_s.values())
         if min(idle_s, self._waited_s) > IDLE * elapsed_s:
+            return True
+        self._start_period()
+        return False
+
+    def review(self, idle: float) -> None:
+        """Double the lead time if the slots were idle, and start the next period.
+
+        `idle` is the fraction of the slot time for which slots had no task of any client.
+        """
+        if idle > IDLE:
             self.grow()
         self._start_period()
 

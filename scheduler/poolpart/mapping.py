@@ -41,6 +41,7 @@ GROWTH = 4  # maximum number of items in a chunk, relative to the number of item
 MOST_BYTES = 2**20  # maximum size of the items and results of a chunk
 MOST_BYTES_IN_FLIGHT = 64 * 2**20  # maximum size of all chunks, unless two per slot are more
 SEND_S = 0.05  # maximum time to collect items of a slow iterable before they are sent
+LOOK_S = 0.1  # minimum interval between requests for idle slots
 CHECK_S = 5.0  # interval between requests for the number of slots
 CHUNK_S = 0.1  # target duration of a task
 CHUNK_S_PER_SLOT = 0.005  # minimum target per slot, so that the scheduler keeps up with many slots
@@ -295,6 +296,7 @@ class Results(Iterator[Any]):
         self._unfinished: list[tuple[int, Sequence[Row], int]] = []
         self._size = ChunkSize()
         self._lead = LeadTime()
+        self._next_look = 0.0  # earliest time to look for idle slots again
         self._running: dict[Future, Chunk] = {}
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that have ended
         # {index of the first item: (finished chunk, its result or the failed task)}
@@ -313,6 +315,8 @@ class Results(Iterator[Any]):
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
             self._waits = [_worker_wait(stage)]
             self._update_slots()
+        self._reviewed = self._capacities
+        self._reviewed_at = time.monotonic()
         self._submit()
 
     def _continue_map(
@@ -408,7 +412,14 @@ class Results(Iterator[Any]):
         This happens in an ordered map if later tasks have finished before a slow one.
         """
         in_flight = len(self._running) - self._ended.qsize()
-        if self._ended.empty() and in_flight < max(self._slots):
+        if not self._ended.empty() or in_flight >= max(self._slots):
+            return
+        if time.monotonic() < self._next_look:
+            return
+        self._next_look = time.monotonic() + LOOK_S
+        # The other slots may be busy with other tasks.
+        self._update_slots()
+        if any(capacity.free for capacity in self._capacities):
             self._lead.grow()
             self._submit()
 
@@ -420,9 +431,9 @@ class Results(Iterator[Any]):
         PoolError
             If tasks of a stage could never run, or have waited too long for workers.
         """
-        request_capacity = [stage.request_capacity() for stage in self._stages]
-        self._slots = [of_stage.max_running for of_stage in request_capacity]
-        for wait, of_stage in zip(self._waits, request_capacity, strict=True):
+        self._capacities = [stage.request_capacity() for stage in self._stages]
+        self._slots = [of_stage.max_running for of_stage in self._capacities]
+        for wait, of_stage in zip(self._waits, self._capacities, strict=True):
             wait.check(of_stage)
         until_next = min(wait.seconds_until_check(CHECK_S) for wait in self._waits)
         self._next_check = time.monotonic() + until_next
@@ -552,7 +563,20 @@ class Results(Iterator[Any]):
             self._undelivered[chunk.first] = chunk, answer
             self._size.update(max(1, len(answer.results)), sum(answer.seconds), answer.nbytes)
             self._lead.count_task(self._busy_s(answer.seconds))
-        self._lead.review(self._sizes()[1])
+        if self._lead.is_short(self._sizes()[1]):
+            self._lead.review(self._idle_fraction())
+
+    def _idle_fraction(self) -> float:
+        """Return for which fraction of the slot time slots had no task since the last call."""
+        earlier, since = self._reviewed, self._reviewed_at
+        self._update_slots()
+        self._reviewed, self._reviewed_at = self._capacities, time.monotonic()
+        elapsed_s = max(self._reviewed_at - since, 1e-9)
+        # In a chain of maps, the partition with the most work limits the rate.
+        return min(
+            (now.idle_s - before.idle_s) / (max(1, now.slots) * elapsed_s)
+            for before, now in zip(earlier, self._capacities, strict=True)
+        )
 
     def _busy_s(self, seconds: Sequence[float]) -> dict[str, float]:
         """Return the time spent in each partition, divided by the number of slots."""

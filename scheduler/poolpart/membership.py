@@ -22,6 +22,7 @@ counts, they are deleted with the last registration.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -39,6 +40,7 @@ from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import current_task
 from .registration import is_registered, record_registration
 from .rules import check_name
+from .shares import slot_use
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
@@ -109,9 +111,14 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
 
 @dataclass(frozen=True)
 class PartitionCapacity:
-    """How many tasks of a given size a partition can run."""
+    """How many tasks of a given size a client can run in a partition."""
 
-    max_running: int  # number of tasks that run at a time, once all adaptive jobs have started
+    # Number of tasks that the client can run at a time, once all adaptive jobs have started. If
+    # other clients use the partition, this is its share of the slots, plus slots that nobody uses.
+    max_running: int
+    slots: int  # number of slots of all workers
+    free: float  # number of slots without a task
+    idle_s: float  # total time for which slots had no task, times the number of these slots
     has_workers: bool  # whether a worker exists, is queued or starting, or can be started
     rejection: str  # reason why the tasks could never run, or ""
 
@@ -121,8 +128,15 @@ def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> Pa
 
     The arguments are the same as in `register`.
     """
+    running = current_task()
     answer: PartitionCapacity = run_on_scheduler(
-        client, _capacity, name=name, slots=slots, by_rule=by_rule
+        client,
+        _capacity,
+        name=name,
+        slots=slots,
+        by_rule=by_rule,
+        client_id=client.id,
+        task_key=None if running is None else running[1].key,
     )
     return answer
 
@@ -328,10 +342,23 @@ def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
 
 
 def _capacity(
-    name: str, slots: int, by_rule: bool, dask_scheduler: Any = None
+    name: str,
+    slots: int,
+    by_rule: bool,
+    client_id: str,
+    task_key: Any,
+    dask_scheduler: Any = None,
 ) -> PartitionCapacity:
+    total = int(sum(dask_scheduler.resources.get(name, {}).values()))
+    use = slot_use(dask_scheduler, name, total, client_id, task_key)
+    max_running = max_running_tasks(dask_scheduler, name, slots)
+    if total:
+        max_running = min(max_running, math.ceil(max_running * use.usable / total))
     return PartitionCapacity(
-        max_running_tasks(dask_scheduler, name, slots),
+        max_running,
+        total,
+        use.free,
+        use.idle_s,
         expects_any_worker(dask_scheduler, name, slots),
         rejection_reason(dask_scheduler, name, slots, by_rule),
     )

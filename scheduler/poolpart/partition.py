@@ -336,9 +336,10 @@ class Partition:
         window
             Maximum number of tasks in flight. By default, the number is chosen so that workers do
             not have to wait for the client: two tasks for each slot or, if tasks are short, one
-            second of work for each slot. The number doubles if workers and client have waited for
-            each other, for example because the client computes between results. It is limited to
-            512 tasks and 64 MiB of items and results, and adapts to the number of slots.
+            second of work for each slot. Slots that are the share of other clients do not count.
+            The number doubles if workers and client have waited for each other, for example because
+            the client computes between results. It is limited to 512 tasks and 64 MiB of items and
+            results, and adapts to the number of slots.
         chunk
             Number of items per task. By default, a task contains as many items as take about a
             tenth of a second (longer if there are many slots), but at most 1 MiB of items and
@@ -464,9 +465,9 @@ class Partition:
         wait
             If False, return a future immediately. A thread of this process submits the tasks.
         window
-            Maximum number of tasks in flight. By default, it is two for each slot, and increases to
-            up to 16 for each slot if slots become idle before this process can submit further
-            tasks. It adapts to the number of slots.
+            Maximum number of tasks in flight. By default, it is two for each slot that is not the
+            share of other clients, and increases to up to 16 for each slot if slots become idle
+            before this process can submit further tasks. It adapts to the number of slots.
         priority, retries, slots
             Options of each task, as in `submit`.
         empty_s

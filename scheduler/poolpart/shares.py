@@ -94,6 +94,7 @@ class _Load:
     used: float = 0.0
     nested: float = 0.0  # slots that nested tasks request, which are included in `used`
     seconds: float = 0.0  # expected slot time of the tasks
+    free: float = 0.0  # number of slots without a task
 
 
 @dataclass
@@ -111,9 +112,9 @@ class PartitionQueue:
     # Workers that have room for a task, starting with the one that has had room the longest.
     with_room: dict[Any, None] = field(default_factory=dict)
     nested_held: int = 0  # number of nested tasks among `held`
-    idle_s: float = 0.0  # slot time for which slots had no tasks, in seconds
-    free_slots: float = 0.0  # number of slots without tasks
-    free_since: float = field(default_factory=time.monotonic)  # time of the last change
+    free_slots: float = 0.0  # number of slots without a task
+    _idle_s: float = 0.0  # time until the last change for which slots had no task, times slots
+    _changed_at: float = field(default_factory=time.monotonic)  # last change of `free_slots`
 
     # -- workers -----------------------------------------------------------------------
 
@@ -133,10 +134,24 @@ class PartitionQueue:
         else:
             self.with_room.pop(worker, None)
 
+        self._set_free(load, max(0.0, slots - load.used))
+
     def forget_worker(self, worker: Any) -> None:
         """Forget a worker that has left. Its tasks have been released before."""
-        self.loads.pop(worker, None)
+        if load := self.loads.pop(worker, None):
+            self._set_free(load, 0.0)
         self.with_room.pop(worker, None)
+
+    def _set_free(self, load: _Load, slots: float) -> None:
+        if slots != load.free:
+            self._idle_s = self.idle_s()
+            self._changed_at = time.monotonic()
+            self.free_slots += slots - load.free
+            load.free = slots
+
+    def idle_s(self) -> float:
+        """Return the total time for which slots had no task, times the number of these slots."""
+        return self._idle_s + self.free_slots * (time.monotonic() - self._changed_at)
 
     def assign(self, key: Any, assignment: _Assignment) -> None:
         """Add a task to the load of its worker."""
@@ -292,6 +307,10 @@ class Shares(SchedulerPlugin):
                 self._clients[key] = (
                     name if submitter is None else self._clients.get(submitter.key, name)
                 )
+
+    def client_of_key(self, key: Any) -> str | None:
+        """Return the client for which a task counts, or None if the task is unknown."""
+        return self._clients.get(key)
 
     def _client_of(self, task: Any) -> str:
         """Return the client that a task counts for.
@@ -634,6 +653,42 @@ def check_weight(weight: object) -> float:
     if isinstance(weight, int | float) and weight is not True and 0 < weight < math.inf:
         return float(weight)
     raise PoolError(f"Invalid weight {weight!r}. Expected a positive number, for example 3.")
+
+
+class SlotUse(NamedTuple):
+    """Slots of a partition that a client can use, and slots that nobody uses."""
+
+    usable: float  # number of slots that the client can expect to get
+    free: float  # number of slots without a task
+    idle_s: float  # total time for which slots had no task, times the number of these slots
+
+
+def slot_use(
+    scheduler: Any, name: str, slots: float, client_id: str, task_key: Any = None
+) -> SlotUse:
+    """Return how many of a partition's slots a client can use at present.
+
+    These are its fair share and, if others do not use theirs, the slots that it uses and those that
+    nobody uses.
+
+    Parameters
+    ----------
+    scheduler, name
+        Scheduler and name of the partition.
+    slots
+        Number of slots of the partition.
+    client_id, task_key
+        ID of the client, and key of the task in which it is used, if any.
+    """
+    shares: Shares | None = scheduler.plugins.get(NAME)
+    if shares is None or name not in shares.queues:
+        return SlotUse(slots, 0.0, 0.0)
+    queue = shares.queues[name]
+    client = shares.client_of_key(task_key) or client_name(client_id)
+    account = queue.policy.accounts.get(client)
+    used = account.slots if account is not None else 0.0
+    usable = max(queue.policy.fair_slots(client, slots), used + queue.free_slots)
+    return SlotUse(min(slots, usable), queue.free_slots, queue.idle_s())
 
 
 def clients_of(scheduler: Any, name: str) -> dict[str, ClientStats]:

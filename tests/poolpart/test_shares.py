@@ -1,5 +1,6 @@
 """Clients of a partition take turns, however and how many tasks each of them submits."""
 
+import itertools
 import time
 from collections import Counter
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from distributed import Client, Event, wait
 from tests.poolpart.helpers import LONG_S, addresses, kill, metrics_of, wait_for
 
 from poolpart import Partition, Pool, PoolError, rest
+from poolpart.membership import request_capacity
 
 ran = []  # names of clients whose tasks have run, in order
 
@@ -107,6 +109,36 @@ def test_a_map_and_each_of_its_items_take_turns_with_other_tasks(pair):
     assert Counter(ran)["alice"] < 60
     assert alice.for_each(["alice"] * 5, run) == 5
     results.close()
+
+
+def test_the_window_of_a_map_follows_its_share(start):
+    client = start({"w": {"resources": {"P": 2}, "nthreads": 2}})
+    with Client(client.cluster, name="bob") as other:
+        alice, bob = Partition("P", client), Partition("P", other)
+        gate = Event("gate", client)
+        blocker = bob.submit(wait_for, "gate")
+        while bob.stats().running < 1:
+            time.sleep(0.01)
+        beside = alice.map(wait_for, itertools.repeat("gate"), chunk=1)
+        time.sleep(0.1)
+        stage = alice.stats().stages["wait_for-map"]
+        assert stage.running + stage.queued == 2  # two tasks for its one slot
+        capacity = request_capacity(client, "P", 1, by_rule=False)
+        assert (capacity.max_running, capacity.slots, capacity.free) == (1, 2, 0)
+        assert capacity.idle_s == request_capacity(client, "P", 1, by_rule=False).idle_s
+        gate.set()
+        assert next(beside)
+        beside.close()
+        assert blocker.result(LONG_S)
+        gate.clear()
+        while bob.stats().clients["bob"].slots:
+            time.sleep(0.01)
+        alone = alice.map(wait_for, itertools.repeat("gate"), chunk=1)
+        time.sleep(0.1)
+        stage = alice.stats().stages["wait_for-map"]
+        assert stage.running + stage.queued == 4
+        gate.set()
+        alone.close()
 
 
 def test_weights(pair, gate):
