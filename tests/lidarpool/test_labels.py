@@ -1,5 +1,6 @@
 """The page on labels: its tables are those of the registry of formats, and its scenario labels."""
 
+import json
 import re
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -146,3 +147,32 @@ def test_the_note_on_classes_without_names_says_what_to_give():
         assert not [note for note in ExportSpec(name).notes(cloud, named) if "class" in note]
     (note,) = [note for note in ExportSpec("e57").notes(cloud, sweeps) if "class" in note]
     assert note.startswith("E57 cannot store ") and "classes:" not in note
+
+
+BUILDING = {
+    "type": "CityJSON",
+    "version": "1.1",
+    "transform": {"scale": [1, 1, 1], "translate": [0, 0, 0]},
+    "CityObjects": {
+        "b": {
+            "type": "Building",
+            "geometry": [{"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2]]]}],
+        }
+    },
+    "vertices": [[0, 0, 0], [9, 0, 0], [0, 0, 9]],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "labeled"), [("nuscenes", True), ("rrd", True), ("laz", True), ("pcd", False)]
+)
+def test_classes_of_files_are_in_formats_that_have_a_field_for_them(tmp_path, name, labeled):
+    (tmp_path / "b.city.json").write_text(json.dumps(BUILDING), "utf-8")
+    data = {"scene": {"files": ["b.city.json"]}, "poses": [[20, 20, 2]]}
+    run = Scenario.from_data(data | {"output": {"write": [name]}}, folder=tmp_path)
+    assert dict(prepare(run).survey.classes) == ({6: "building"} if labeled else {})
+    job = prepare(Scenario.from_data(data, folder=tmp_path), columns=ExportSpec(name).added)
+    names = {column.name for column in job.survey.stored_columns}
+    assert ("class" in names) == labeled
+    plain = prepare(Scenario.from_data({"scene": "seed"}), columns=ExportSpec(name).added)
+    assert "class" not in {column.name for column in plain.survey.stored_columns}

@@ -657,12 +657,14 @@ def _build_survey(
     """Create the survey in local coordinates, with a trajectory or poses.
 
     `columns` contains the names of columns to add to the cloud, besides those that the scenario and
-    the formats require.
+    the formats require. The class is only added if a material has a class.
     """
     scenario = survey_parts.scenario
     sensors = survey_parts.sensors
     format_columns = scenario.output.needs
     cloud = declared_values(scenario.cloud, CloudOptions)
+    if not any(material.semantic_class for material in materials):
+        columns = [name for name in columns if name != "class"]
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
     if not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
