@@ -114,7 +114,8 @@ class CandidateResult:
     @property
     def order(self) -> tuple[float, ...]:
         """Sort key that places the best candidate first."""
-        return (-self.score, sum(self.blind_m2.values()), -sum(self.mean_points.values()))
+        known = [points for points in self.mean_points.values() if np.isfinite(points)]
+        return (-self.score, sum(self.blind_m2.values()), -sum(known))
 
 
 class _Areas(NamedTuple):
