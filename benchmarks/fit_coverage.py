@@ -144,7 +144,7 @@ def recorded(
         columns = {"channel": channel, "intensity": arrays[f"intensity{number}"]}
         return Sweep(points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], columns)
 
-    return Recording("simulated", sweeps, read, energies=True)
+    return Recording("simulated", sweeps, read, energy_unit=1.0)
 
 
 def trial(

@@ -55,7 +55,7 @@ def augmenters() -> list[Augmenter]:
     cloud = scanner.sweep(Pose((-6.0, -3.0, HEIGHT_M)))
     columns = {name: cloud[name] for name in ("channel", "intensity")}
     sweep = Sweep(np.asarray(cloud.positions, np.float64), columns)
-    recording = Recording("drive", 1, lambda _: sweep, energies=True)
+    recording = Recording("drive", 1, lambda _: sweep, energy_unit=1.0)
     return [Augmenter(recording, effects, model) for effects in PANELS.values()]
 
 

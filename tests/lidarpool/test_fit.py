@@ -516,7 +516,7 @@ def test_where_only_the_ground_is_smooth_noise_is_not_determined():
 
 @pytest.mark.extended
 def test_intensities_of_unknown_scale_need_the_white_one():
-    made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energies=False)
+    made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energy_unit=None)
     found = fit(made)
     assert "detection_range_m" not in found.figures["figures"]
     assert "--white-intensity" in repr(found)

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import LidarError, compare, load_trajectory, twin
 from lidarpool.comparing.fit.stack import SweepStack
+from lidarpool.pages.opened import open_view
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
@@ -375,6 +376,15 @@ def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
     recording = open_recording(write_bag(tmp_path / "simulated", simulated))
     assert [*recording.stamps_ns] == [1e8 * number for number in range(SWEEPS)]
     assert [*recording.notes] == []
+
+
+def test_a_single_topic_is_the_name_of_the_sensor(tmp_path):
+    path = write_bag(tmp_path / "bag", drive(relative))
+    recording = open_recording(path)
+    assert recording.sensor == recording[0].sensor == "/points"
+    assert open_view(path).sweeps.sensors == ("/points",)
+    kitti(tmp_path / "kitti", range(3), 3)
+    assert open_view(tmp_path / "kitti").sweeps.sensors == ("",)
 
 
 def transforms_but(number, **changes):

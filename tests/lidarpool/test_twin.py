@@ -412,7 +412,7 @@ def test_intensities_that_are_compensated_for_range_are_found(drive, survey):
         intensity = sweep.intensity * np.square(sweep.points).sum(axis=1)
         return sweep.replace(columns={**sweep.columns, "intensity": intensity})
 
-    found = twin(replace(opened, read=read, energies=False))
+    found = twin(replace(opened, read=read, energy_unit=None))
     assert found.figures["response"]["model"] == "compensated for range"
     elevation_deg = np.sort(np.degrees(survey.sensor.beams.elevation))
     np.testing.assert_allclose(found.model.beams.elevation_deg, elevation_deg, atol=0.002)

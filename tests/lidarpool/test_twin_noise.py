@@ -157,7 +157,7 @@ def test_a_twin_has_the_intensity_response_of_the_sensor(tmp_path):
         columns = {"ring": sweep.rings, "timestamp": time_s, "intensity": sweep.intensity}
         return Sweep(sweep.points, columns)
 
-    found = twin(Recording("drive", len(opened), read, energies=True))
+    found = twin(Recording("drive", len(opened), read, energy_unit=1.0))
     found.save(tmp_path / "twin")
     sensor = load_sensor(tmp_path / "twin" / "sensor.yaml")
     # On the ground, the incidence follows from the range, so they cannot be told apart exactly.

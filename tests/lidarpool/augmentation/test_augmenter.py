@@ -62,7 +62,7 @@ def recording_of(clouds, **fields):
         return Sweep(np.asarray(cloud.positions, np.float64), columns)
 
     stamps_ns = 1e8 * np.arange(len(clouds))
-    options = {"energies": True, "read_stamps": lambda: stamps_ns, "compensated": False}
+    options = {"energy_unit": 1.0, "read_stamps": lambda: stamps_ns, "compensated": False}
     return Recording("drive", len(clouds), read, **options | fields)
 
 
@@ -201,7 +201,7 @@ def test_the_number_of_a_sweep_determines_its_random_numbers(clear, sensor):
 
 def test_inserted_car_has_the_points_of_a_simulation_with_the_car(scene, sensor):
     ideal = replace(sensor, noise=None)
-    recording = recording_of(scan(scene, ideal, 1), energies=True)
+    recording = recording_of(scan(scene, ideal, 1), energy_unit=1.0)
     pose = Pose((12, -3, 0), yaw_deg=30)
     (truth,) = scan(scene.with_actors([_static(CAR, pose)]), ideal, 1)
     insertion = Insertion(CAR, 12, -3, -HEIGHT_M, heading_deg=30, class_name="")
@@ -329,7 +329,7 @@ def test_unknown_rings_are_noted(clear, sensor):
         noise = 0.02 * np.random.default_rng(number).normal(size=(len(rows), 3))
         return Sweep(sweep.points[rows] + noise, columns)
 
-    recording = Recording("drive", SWEEPS, without_rings, energies=True)
+    recording = Recording("drive", SWEEPS, without_rings, energy_unit=1.0)
     augmenter = Augmenter(recording, Effects(weather=Weather(visibility_km=0.1)), sensor)
     assert any("pulses without a return are unknown" in note for note in augmenter.notes)
     result = augmenter.sweep(0)

@@ -92,7 +92,7 @@ def recording(sensor):
     cloud = scanner.sweep(Pose((0, 0, 0)))
     columns = {name: cloud[name] for name in ("channel", "intensity")}
     sweep = Sweep(np.asarray(cloud.positions, np.float64), columns)
-    return Recording("box", 1, lambda _: sweep, energies=True)
+    return Recording("box", 1, lambda _: sweep, energy_unit=1.0)
 
 
 def augment(recording, sensor, visibility_km):

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.drives import SCANS, points_of, the_scene
 from tests.street_recordings import COUNT, record, reflectances, street
 
 from lidarpool import load_sensor
 from lidarpool.augmentation.intensity_fit import NearFactors, Quantization
 from lidarpool.augmentation.intensity_scale import IntensityScale
 from lidarpool.clouds.recording import Recording
+from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import normal_incidence_energy
@@ -66,6 +68,40 @@ def byte_scale(**fields):
     return IntensityScale(**common | fields).with_codes(VELODYNE)
 
 
+def drive_energies(written, layout, name, sensor):
+    """Return the scale of an exported drive, and its converted and true energies."""
+    path = written(name, layout=layout)
+    recording = open_recording(path, sensor)
+    scale = IntensityScale.for_recording(recording)
+    cloud = points_of(the_scene(), 0)
+    true = cloud["intensity"][cloud["scan"] < SCANS].astype(float)
+    sweep = recording[0]
+    return scale, scale.energies(sweep.columns[scale.column], np.ones(len(sweep))), true
+
+
+@pytest.mark.parametrize(
+    ("layout", "white", "step"),
+    [("velodyne", 1, 0), ("images", 1, 0), ("autoware", 255, 1 / 255), ("ouster", 10_000, 1e-4)],
+)
+@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
+def test_bags_of_lidarpool_contain_energies(written, layout, white, step, name):
+    scale, found, true = drive_energies(written, layout, name, "/front/points")
+    assert (scale.is_known, scale.note, scale.white, scale.compensated) == (True, "", white, False)
+    # Values of 0 were rounded down, and the greatest value may be greater.
+    usable = (true > step) & (true < 1 - step)
+    np.testing.assert_allclose(found[usable], true[usable], rtol=1e-6, atol=0.51 * step)
+    given_column = open_recording(written(name, layout=layout), "/front/points", "ring")
+    assert given_column.energy_unit is None
+
+
+@pytest.mark.parametrize("layout", ["hesai", "robosense", "livox"])
+def test_reflectivities_in_bags_require_a_model(written, layout):
+    recording = open_recording(written("mcap", layout=layout), "/front/points")
+    assert recording.energy_unit is None
+    note = IntensityScale.for_recording(recording).note
+    assert note.startswith("The intensity scale of ") and "is unknown. A white surface" in note
+
+
 # -- known scales ----------------------------------------------------------------------------
 
 
@@ -106,7 +142,7 @@ def test_all_codes_survive_a_round_trip(maker, dtype, unit):
 
 
 def test_results_contain_energies():
-    recording = record(energies_times(1.0), energies=True)
+    recording = record(energies_times(1.0), energy_unit=1.0)
     scale = IntensityScale.for_recording(recording)
     assert scale.is_known
     assert not scale.note

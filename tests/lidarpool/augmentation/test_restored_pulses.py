@@ -53,7 +53,7 @@ def recording_of(clouds, *, compensated=False):
         "drive",
         SWEEPS,
         read,
-        energies=True,
+        energy_unit=1.0,
         read_stamps=lambda: stamps_ns,
         read_poses=lambda: poses,
         compensated=compensated,

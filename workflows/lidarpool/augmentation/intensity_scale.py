@@ -122,10 +122,10 @@ class IntensityScale:
     ) -> IntensityScale:
         """Determine the intensity scale of a recording from at most five sweeps.
 
-        The scale is known for results, for packet captures, and for 8-bit codes if the sensor model
-        is given. Otherwise it is assumed that the scale is a common one if surfaces then have
-        plausible reflectances. If no common scale is plausible, the intensity of a white surface is
-        estimated from the brightest surfaces.
+        The scale is known for results, for bags of lidarpool with energies, for packet captures,
+        and for 8-bit codes if the sensor model is given. Otherwise, a common scale is assumed if
+        surfaces then have plausible reflectances. If no common scale is plausible, the intensity of
+        a white surface is estimated from the brightest surfaces.
 
         Parameters
         ----------
@@ -378,7 +378,8 @@ def _primary_column(recording: Recording, returns: RecordedReturns, model: Senso
     intensity, reflectivity = STRENGTHS
     if available != [intensity, reflectivity] or recording.intensity_column is not None:
         return available[0]
-    if recording.energies or recording.white is not None or _has_simulated_energies(returns):
+    is_stated = recording.energy_unit is not None or recording.white is not None
+    if is_stated or _has_simulated_energies(returns):
         return intensity
     is_calibrated = model is not None or _is_ouster(columns)
     return reflectivity if is_calibrated and _are_bytes(columns[reflectivity]) else intensity
@@ -509,11 +510,15 @@ class _Fit:
         """Return the scale if it is known, otherwise None."""
         recording = self.recording
         quantization = common.quantization
-        is_energy = recording.energies or _has_simulated_energies(self.returns)
-        if is_energy and self.column == "intensity":
-            # The energies of a result are not limited, even if several returns are equal.
-            limits = quantization._replace(max_value=np.inf)
-            return replace(common, compensated=False, quantization=limits)
+        unit = recording.energy_unit
+        if unit is None and _has_simulated_energies(self.returns):
+            unit = 1.0
+        if unit is not None and self.column == "intensity":
+            limits = quantization
+            if not quantization.steps_per_unit:
+                # The energies of a result are not limited, even if several returns are equal.
+                limits = quantization._replace(max_value=np.inf)
+            return replace(common, compensated=False, white=unit, quantization=limits)
         maker = "velodyne" if self.model is None else self.model.optics.reflectivity
         codes = SCALES[maker]
         if recording.white is not None:

@@ -148,6 +148,8 @@ class Recording:
         to the points of a result. Shape (3,). None if nothing was added, or if it is unknown.
     is_metric
         Whether the format defines coordinates as true meters, regardless of the coordinate system.
+    sensor
+        Name of the sensor or topic, or an empty string.
     sequence
         Name of the drive if the file contains several drives, each with its own world frame.
         Otherwise an empty string.
@@ -162,8 +164,9 @@ class Recording:
         Whether some returns were discarded, so that gaps are not necessarily lost returns.
     white
         Intensity of a white surface, if it does not depend on the range.
-    energies
-        Whether intensities are energies, as in results.
+    energy_unit
+        Intensity of a white surface at 10 m if intensities are proportional to energies, otherwise
+        None. In results, it is 1.
     ray_times
         Times and poses that identify the rays of the recording, or None if they are unknown.
     noise_classes
@@ -191,13 +194,14 @@ class Recording:
     epsg: int | None = None
     world_origin: Floats | None = None
     is_metric: bool = False
+    sensor: str = ""
     sequence: str = ""
     calibration: Path | None = None
     stations: Sequence[str] = ()
     files: Sequence[str] = ()
     thinned: bool = False
     white: float | None = None
-    energies: bool = False
+    energy_unit: float | None = None
     ray_times: RayTimes | None = None
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
     notes: Sequence[str] = ()
@@ -298,6 +302,8 @@ class Recording:
             changes = {"recording": self, "number": number or 0}
         if sweep.compensated is None:
             changes["compensated"] = self.compensated
+        if not sweep.sensor:
+            changes["sensor"] = self.sensor
         return sweep.replace(points=points, columns=columns, pose=pose, **changes)
 
     def _chosen_intensity(self, stored: Columns, standard: Columns) -> Columns:
@@ -316,6 +322,11 @@ class Recording:
             f"it has no column {name!r} that could be used as intensity."
             + (did_you_mean(name, stored) or available)
         )
+
+    @property
+    def energies(self) -> bool:
+        """Whether intensities are energies, as in results."""
+        return self.energy_unit == 1
 
     @property
     def intensity_name(self) -> str:
@@ -474,7 +485,8 @@ class RecordingSource:
 
         A single sensor may have an empty name.
         """
-        return sensors[self.choose("sensors", sensors)]
+        name = self.choose("sensors", sensors)
+        return replace(sensors[name], sensor=name)
 
     def prefix_notes(self, clauses: Iterable[str]) -> tuple[str, ...]:
         """Turn clauses into notes by prepending the name of the recording."""
@@ -659,7 +671,8 @@ def open_cloud(
 
     stamps_ns = saved.begins_ns[indices] + (saved.start_ns or 0)
     # The column `intensity` of a result contains energies. Another column may be chosen.
-    fields["energies"] = intensity in (None, "intensity")
+    fields["energy_unit"] = 1.0 if intensity in (None, "intensity") else None
+    fields["sensor"] = saved.sensors[sensor_index]
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:
         # `compared_sweep` identifies rays by their time if possible, otherwise by their number.

@@ -315,7 +315,7 @@ def _fit_to_sweeps(
         sweeps.name,
         len(chosen),
         compensated if is_compensated else fired,
-        energies=are_energies,
+        energy_unit=1.0 if are_energies else None,
         read_poses=lambda: poses,
         fired=None if is_compensated else fired,
         noise_classes=None,

@@ -60,14 +60,15 @@ class UnknownFormatError(LidarError):
 def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
     """Open the recordings of all sensors or topics as {name: recording}.
 
-    The name is empty if there is only one sensor. If the source contains several sequences, which
-    have different world frames, only the first sequence is opened.
+    The name is empty if a single sensor has no name. If the source contains several sequences,
+    which have different world frames, only the first sequence is opened.
 
     Raises the same errors as `open_recording`.
     """
     opened = partial(open_recording, source, keep_noise=keep_noise)
     try:
-        return {"": opened()}
+        recording = opened()
+        return {recording.sensor: recording}
     except SeveralSensorsError as error:
         recordings = {name: opened(sensor=name) for name in error.names}
     sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
@@ -75,7 +76,7 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
         return recordings
     note = f"Only {sequences[0]}, the first of {len(sequences):,} sequences, is shown."
     return {
-        name: replace(recording, notes=(note,))
+        name: replace(recording, notes=(*recording.notes, note))
         for name, recording in recordings.items()
         if recording.sequence == sequences[0]
     }

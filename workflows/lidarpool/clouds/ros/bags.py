@@ -49,6 +49,7 @@ from ..recording import Recording, RecordingSource, sweep_from_columns
 from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
+_LAYOUT_KEY = "lidarpool_layout"  # custom data of bags that were written by lidarpool
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _LABEL_TOPIC = "/label_info"
 _LABELS = "vision_msgs/msg/LabelInfo"
@@ -132,6 +133,7 @@ class Rosbag2(CloudFormat):
         # ROS 2 Humble cannot read later versions, because QoS profiles are lists from version 9 on.
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
             bag.set_custom_data("lidarpool", self.sweeps.frame_text(compensated=spec.compensated))
+            bag.set_custom_data(_LAYOUT_KEY, spec.layout)
             topics: dict[str, Any] = {}
             for message in survey_messages(
                 self.cloud, self.sweeps, message_layout, spec.pose_rate_hz
@@ -345,6 +347,7 @@ def _open_bag(source: RecordingSource) -> Recording:
     def read_stamps() -> Iterator[float]:
         return (float(header.stamp_ns) for header in headers())
 
+    custom_data = _custom_data(source.path)
     unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
     notes = [*source.prefix_notes(unstamped)]
 
@@ -362,7 +365,9 @@ def _open_bag(source: RecordingSource) -> Recording:
         read_classes=lambda: _class_names(bags()),
         read_boxes=lambda: _boxes(bags(), [*headers()], read_poses()),
         notes=notes,
-        compensated=_stated_compensation(source.path),
+        compensated=states_compensation(custom_data),
+        energy_unit=_energy_unit(custom_data, connection, source.intensity),
+        sensor=connection.topic,
     )
 
 
@@ -413,8 +418,8 @@ def _boxes(
     return RecordedBoxes.from_rows(rows.values()) if rows else None
 
 
-def _stated_compensation(path: Path) -> bool | None:
-    """Return whether a bag is motion-compensated, or None if it does not state this.
+def _custom_data(path: Path) -> str:
+    """Return the text with the custom data of a bag.
 
     This does not use rosbags, which only reads custom data from folders.
     """
@@ -422,7 +427,21 @@ def _stated_compensation(path: Path) -> bool | None:
         text = read_input_text(path / "metadata.yaml", errors="replace")
     else:
         text = read_metadata(path).get("rosbag2", {}).get("serialized_metadata", "")
-    return states_compensation(re.sub(r"[\s\\]+", " ", text))  # YAML breaks long lines
+    return re.sub(r"[\s\\]+", " ", text)  # YAML breaks long lines
+
+
+def _energy_unit(custom_data: str, connection: Any, intensity: str | None) -> float | None:
+    """Return the intensity of a white surface at 10 m in a bag that was written by lidarpool.
+
+    Returns None for other bags and for messages whose intensities are not energies. `intensity` is
+    the column that the user chose.
+    """
+    stated = re.search(rf"{_LAYOUT_KEY}: (\w+)", custom_data)
+    layout = LAYOUTS.get(stated[1]) if stated else None
+    is_described = connection.msgtype == POINT_CLOUD and intensity in (None, "intensity")
+    if layout is None or not is_described or not layout.has_energies():
+        return None
+    return layout.full_intensity
 
 
 class MessageHeader(NamedTuple):

@@ -74,6 +74,12 @@ class PointLayout(ABC):
     lines: ClassVar[str] = ""
     no_intensity: ClassVar[float] = 0
 
+    @classmethod
+    def has_energies(cls) -> bool:
+        """Return whether the field `intensity` contains energies, rather than reflectivities."""
+        (field,) = (field for field in cls.point_fields if field.name == "intensity")
+        return field.columns in (("intensity",), ("signal",))
+
     @abstractmethod
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
         """Return the values of all fields except position, ring and time, keyed by field name.
