@@ -82,8 +82,8 @@ def test_clouds_are_in_world_coordinates(written, tmp_path):
     for name in ("return_number", "number_of_returns", "gps_time"):
         assert not np.asarray(file[name]).any(), name
     assert notes == [
-        "LAS stores 0 as return number, number of returns and GPS time, because the cloud has no "
-        "columns return_number, returns or time."
+        "LAS stores 0 as return number, number of returns and GPS time, because "
+        f"{written('kitti')} has no columns return_number, returns or time."
     ]
     made = converter(written("kitti"), "ply", "01")
     rewrite(made, tmp_path / "new.ply", tmp_path / "work2", changed)

@@ -277,7 +277,8 @@ class FormatConverter(Rewriter):
             if name in summary.recorded and name not in _STRENGTHS
         ]
         notes = self._notes(summary, needed)
-        notes += [f"{spec.title} {text}." for text in spec.describe_empty_fields(cloud, sweeps)]
+        empty = spec.describe_empty_fields(cloud, sweeps, source=self.source.name)
+        notes += [f"{spec.title} {text}." for text in empty]
         if unsupported:
             notes.append(f"{spec.title} cannot store {join_names(unsupported)}.")
         return notes

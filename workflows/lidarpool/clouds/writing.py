@@ -221,12 +221,16 @@ class ExportSpec(FileSection):
         ]
 
     def describe_empty_fields(
-        self, cloud: CloudLike, sweeps: Sweeps, survey: Survey | None = None
+        self,
+        cloud: CloudLike,
+        sweeps: Sweeps,
+        survey: Survey | None = None,
+        source: str = "the cloud",
     ) -> list[str]:
         """Describe what the format stores in the fields that `empty_fields` returns.
 
         The result contains a text such as "stores 0 as GPS time, because the cloud has no column
-        time" for each stored value.
+        time" for each stored value. `source` is the name of the cloud.
         """
         fields = self.empty_fields(cloud, sweeps, survey)
         present = {column.name for column in cloud.table}
@@ -238,7 +242,7 @@ class ExportSpec(FileSection):
             verb = "omits" if stored == OMITTED else f"stores {stored} as"
             noun = "column" if len(columns) == 1 else "columns"
             texts.append(
-                f"{verb} {join_names([field.name for field in group])}, because the cloud has no "
+                f"{verb} {join_names([field.name for field in group])}, because {source} has no "
                 f"{noun} {join_alternatives([*columns])}"
             )
         return texts
