@@ -2,6 +2,7 @@
 
 import re
 import threading
+import time
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import SimpleNamespace
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
-from lidarpool import Actor, Pose, Scene, Sensor, Survey, Track, box
+from lidarpool import Actor, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarpool.pages.downloads import downloads
+from lidarpool.pages.live_page import LivePage
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE
@@ -171,6 +173,69 @@ def test_a_flight_opens_with_all_of_its_site_and_a_cloud_with_its_sides(new_tab,
             tab.open(page.url)
             tab.wait_for(lambda _, tab=tab: tab.value(f"window.{PICTURE}?.drawn") == COUNT)
             assert 0.8 < tab.value(f"{FARTHEST}({places})") < 1
+
+
+def test_a_player_of_several_sensors_stops_once_at_each_time(new_tab, tmp_path):
+    """The second sensor starts 0.3 ms later, and its sweeps belong to the same stops."""
+    scene = Scene.from_meshes([box("Room", (20, 20, 0.1))])
+    late = replace(Sensor.grid(layers=4), start_ns=300_000.0)
+    front = Mounted(Sensor.grid(layers=4), name="front")
+    sensors = [front, Mounted(late, Pose((-2, 0, 0)), name="rear")]
+    track = Track([0, 1], [[0, 0, 2], [8, 0, 2.0]])
+    survey = Survey(sensors=sensors, trajectory=track, steps=144)
+    content, _ = PictureContent.before_casting(scene, survey)
+    sweeps = Sweeps.from_survey(survey, scene)
+    view = View(CloudFile(spiral(tmp_path / "cloud.ply", WET), [WET]), content, sweeps)
+    with page_server(view.answer, port=0) as page:
+        tab = opened(new_tab, page)
+        told = []
+        for number in range(1, 5):
+            at = f"sweep {number} of 4"
+            tab.wait_for(lambda text, at=at: at in text)
+            told.append(tab.value("document.querySelector('#time .now').textContent"))
+            tab.key("ArrowRight")
+        assert [words.split(" s")[0] for words in told] == ["0.000", "0.100", "0.200", "0.300"]
+        assert tab.value("lidarpool.steps[1]") == pytest.approx(0.1003)
+        assert tab.errors == []
+
+
+def test_pages_that_are_opened_during_and_after_a_run_are_alike(view, new_tab, tmp_path):
+    live = LivePage(1, (), "a spiral")
+    during = View(view.points, view.pictured)
+    ended = threading.Event()
+
+    def answer(question, arguments, is_disconnected):
+        shown = view if ended.is_set() else during
+        if question != "news":
+            header, arrays = shown.answer(question, arguments, is_disconnected)
+            live_header = {"live": True, "sampled": False, "title": "a spiral"}
+            return header | (live_header if question == "state" else {}), arrays
+        if ended.is_set() and not live._status.over:
+            live.finish(3.0)
+        header, _ = live.answer("jobs", {}, is_disconnected)
+        versions = {"rays_version": 1, "hits_version": 1, "version": shown.version}
+        ends = {"ends": int(ended.is_set()), "path": None, "time": None, "points": COUNT}
+        return header | versions | ends, {"rays": shown.displayed_rays}
+
+    shown_now = (
+        "[...lidarpool.picture.camera.position.toArray().map((value) => value.toFixed(6)), "
+        "lidarpool.chosen.show, document.querySelector('#panel').innerText.split('slots')[0], "
+        "document.querySelector('#labels').innerText]"
+    )
+    with page_server(answer, port=0) as page:
+        early = opened(new_tab, page)
+        early.wait_for(lambda text: "30,000 points" in text)
+        ended.set()
+        early.wait_for(lambda text: "done" in text and "sweep 1 of 10" in text)
+        late = opened(new_tab, page)
+        late.wait_for(lambda text: "done" in text and "sweep 1 of 10" in text)
+        expected = late.wait_for(lambda _: late.value(shown_now))
+        found: list[object] = []
+        same = time.monotonic() + 20
+        while found != expected and time.monotonic() < same:
+            found = early.value(shown_now)
+        assert found == expected
+        assert early.errors == late.errors == []
 
 
 def test_a_server_that_is_busy_at_first_is_asked_again(view, new_tab):

@@ -311,6 +311,36 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert not told["over"]
 
 
+def test_a_finished_campaign_shows_its_last_job():
+    """Of other jobs, the first is read, and those for which there is time."""
+    with campaign_shown(4) as live:
+        shown = []
+        for number in (1, 0, 3, 2):
+            store = RunStore(make_job(4))
+            commit(store, 0, [5], [7], [25])
+            live.on_job_end(row(number))
+            live.on_job_written(row(number), store.only_job)
+            shown.append(ask(live.page.url, "jobs")["newest"])
+        live.finish(9.0)
+        assert ask(live.page.url, "jobs")["newest"] == [2, "0002"]
+    assert shown == [[1, "0001"], [1, "0001"], [1, "0001"], [2, "0002"]]
+
+
+def test_a_page_that_is_opened_early_has_the_state_of_one_that_is_opened_late():
+    store = RunStore(make_job(100))
+    with shown(store) as live:
+        early = ask(live.page.url, "state")
+        for scan in range(100):
+            commit(store, scan, [33], [scan % 10], [165])
+            live.on_parts([store.only_job.parts.part_of(scan)])
+        wait_for(lambda: displayed(live) > 0)
+        late = ask(live.page.url, "state")
+    before, after = early.pop("arrays"), late.pop("arrays")
+    assert {name for name in early if early[name] != late[name]} == {"version"}
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[name], after[name]) for name in before.keys() - {"rays"})
+
+
 def load(busy, seconds, slots=2):
     """What a partition says of itself."""
     return {"GPU": PartitionStats(name="GPU", busy=busy, slots=slots, seconds=seconds)}

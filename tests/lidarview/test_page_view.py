@@ -17,6 +17,8 @@ from lidarpool import (
     Cloud,
     Column,
     LidarError,
+    Material,
+    Mounted,
     Pose,
     Scene,
     SceneInstance,
@@ -39,6 +41,7 @@ from lidarview.picture_file import (
     PlannedPath,
     PlanningPicture,
     SensorPositions,
+    sensor_positions,
 )
 from lidarview.render.coloring import make_coloring
 from lidarview.viewer import point_selection as points
@@ -858,3 +861,54 @@ def test_points_that_are_nowhere_are_not_found(tmp_path):
     local[::2, 0] = np.nan
     finder = PointFinder(CloudFile(write(tmp_path / "a.ply", local)), np.zeros(3))
     assert finder.find_points(1000)[0].tolist() == list(range(1, 1000, 2))
+
+
+def phased_survey(**options):
+    """Return a survey of a drive with two sensors, the second of which starts 0.3 ms later."""
+    late = replace(Sensor.grid(layers=4), start_ns=300_000.0)
+    sensors = [
+        Mounted(Sensor.grid(layers=4), Pose((1, 0, 0)), name="front"),
+        Mounted(late, Pose((-1, 0.5, 0), yaw_deg=180), name="rear"),
+    ]
+    track = Track([0, 2], [[0, 0, 2], [8, 0, 2.0]], [[0, 0, 0, 1], [0, 0, 1, 0.0]])
+    return Survey(sensors=sensors, trajectory=track, **options)
+
+
+def test_the_duration_ends_with_the_last_sweep_of_any_sensor(tmp_path):
+    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])
+    sweeps = Sweeps.from_survey(phased_survey(steps=360), scene)
+    positions = np.zeros((10, 3))
+    view = View(CloudFile(write(tmp_path / "cloud.ply", positions), ()), None, sweeps)
+    assert view.duration_ns == pytest.approx(1e9 + 300_000)
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_positions_of_sensors_are_those_of_their_scans(moves):
+    survey = phased_survey(steps=360)
+    if not moves:
+        poses = [Pose((0, 0, 2), yaw_deg=30), Pose((4, 0, 1), pitch_deg=20)]
+        survey = replace(survey, trajectory=None, poses=poses)
+    rear = sensor_positions(survey)[1]
+    first = survey.scan_count // 2  # of the second sensor
+    scans = [first, first + 360] if not moves else [first, first + 180, first + 359]
+    rows = [0, 1] if not moves else [0, 180, 359]
+    assert len(rear.positions) == (360 if moves else 2) and rear.name == "rear"
+    expected = [survey.pose(scan).position for scan in scans]
+    assert np.allclose(rear.positions[rows], expected, atol=1e-12)
+    assert np.allclose(rear.times_ns[rows], [survey.begins_ns(scan) for scan in scans])
+
+
+def test_classes_of_actors_are_known_before_they_have_points(tmp_path):
+    van = Actor(box("Van", (4, 2, 2)), Track([0, 1], [[5, 0, 0], [9, 0, 0.0]]))
+    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])
+    scene = replace(scene, actors=(van,))
+    materials = [Material("Van", semantic_class=7), Material("*", semantic_class=2)]
+    survey = replace(phased_survey(steps=36), materials=materials, columns=["class"])
+    content, _ = PictureContent.before_casting(scene, survey)
+    content = replace(content, hit_counts=np.zeros(content.scene.triangles, np.int64))
+    content.save(tmp_path / PICTURE_FILE)
+    kind = np.uint16 if TABLE["class"].dtype == "uint16" else np.uint8
+    empty = Cloud(np.zeros((0, 3)), {"object": np.zeros(0, np.int32), "class": np.zeros(0, kind)})
+    for pictured in (content, PictureContent.load(tmp_path / PICTURE_FILE)):
+        header, _ = View(InMemoryPoints(empty), pictured).answer("state", {}, lambda: False)
+        assert header["actors"] == [{"name": "Van", "class": 7}]

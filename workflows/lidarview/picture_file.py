@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarsim.columns.table import CAUSES, TABLE, Column, names_by_value
 from lidarsim.io.archives import open_archive, pack_arrays
 from lidarsim.media.materials import MaterialTable
-from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
+from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, mounted_poses, presence_ns
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32, Ints32
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.animation import Animation
@@ -127,6 +128,8 @@ class PictureContent:
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
     face_materials: Ints32 | None = None  # (f,) material of each static triangle, -1 for none
+    # (objects,) class of each object, with actors last; None if unknown. The first class counts.
+    object_classes: NDArray[np.uint16] | None = None
 
     @classmethod
     def before_casting(
@@ -160,6 +163,7 @@ class PictureContent:
             classes=names_by_value(survey.classes),
             materials=scene.material_names,
             face_materials=drawn.scene.face_materials,
+            object_classes=materials.semantic_class[kinds.first[:-1]],
         )
         return content, drawn
 
@@ -241,6 +245,8 @@ class PictureContent:
             arrays["reflectance"] = self.reflectance
         if self.face_materials is not None:
             arrays["face_materials"] = self.face_materials
+        if self.object_classes is not None:
+            arrays["object_classes"] = self.object_classes
         if self.scene.colors is not None:
             arrays["colors"] = self.scene.colors.mean_colors()
         arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
@@ -372,6 +378,7 @@ class PictureContent:
             classes=names.get("classes"),
             materials=names.get("materials"),
             face_materials=arrays.get("face_materials"),
+            object_classes=arrays.get("object_classes"),
         )
 
 
@@ -410,7 +417,12 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
         if path.moves:
             scans = np.unique(np.linspace(first, stop - 1, MAX_POSITIONS).astype(int)).tolist()
         times = np.array([survey.begins_ns(scan) for scan in scans])
-        positions = np.array([survey.pose(scan).position for scan in scans])
+        if path.moves:
+            positions, _ = mounted_poses(path, 0, carried.mount, times)
+        else:
+            at_start = np.zeros(1)
+            found = [mounted_poses(path, k, carried.mount, at_start) for k in range(path.stations)]
+            positions = np.concatenate([position for position, _ in found])
         sensors.append(
             SensorPositions(times, positions, path.moves, carried.name, carried.sensor.model)
         )

@@ -51,14 +51,14 @@ class JobViews:
         """Record that a browser has requested points of the newest job."""
         self._requested_at = time.monotonic()
 
-    def read(self, row: JobRow, job: StoredJob, is_only: bool) -> None:
-        """Read the points of a job if it is the only job or if a browser shows points of jobs.
+    def read(self, row: JobRow, job: StoredJob, is_last: bool) -> None:
+        """Read the points of a job if a browser shows points of jobs.
 
-        The points of the first job are always read. Those of other jobs are only read if the CPU
-        share permits it.
+        The points of the first and of the last job are always read. Those of other jobs are only
+        read if the CPU share permits it.
         """
         watched = time.monotonic() - self._requested_at <= WATCHED_S and self.reading.is_due
-        if self.jobs and not (is_only or watched):
+        if self.jobs and not (is_last or watched):
             return
         with self.reading.use(READ_EVERY_S):
             live = self.jobs.get(row.number) or LiveJob(job, row.name)

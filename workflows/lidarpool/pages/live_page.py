@@ -113,8 +113,13 @@ class LivePage(RunPage):
         self._charts.add_job(row)
 
     def on_job_written(self, row: JobRow, job: StoredJob) -> None:
-        """Read the points of a job if a browser displays points and the CPU limit permits it."""
-        self._views.read(row, job, is_only=self._count == 1)
+        """Read the points of a job if a browser displays points and the CPU limit permits it.
+
+        Those of the last job are always read, so that the page of a finished run shows them.
+        """
+        sums = self._listed.sums
+        is_last = self._count == 1 or sums["done"] + sums["failed"] == self._count
+        self._views.read(row, job, is_last=is_last)
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
         """Show that the run has finished, with the result if it was a survey.

@@ -214,8 +214,12 @@ class View:
             return self.pictured.duration_ns
         if self.sweeps is None or not len(self.sweeps):
             return 0.0
-        starts = np.unique(self.sweeps.begins_ns)
-        return float(starts[-1] + (np.diff(starts).min() if len(starts) > 1 else 0))
+        ends = []
+        for sensor in range(len(self.sweeps.sensors)):
+            starts = np.unique(self.sweeps.begins_ns[self.sweeps.sensor == sensor])
+            if len(starts):
+                ends.append(starts[-1] + (np.diff(starts).min() if len(starts) > 1 else 0))
+        return float(max(ends))
 
     @property
     def _station_names(self) -> Sequence[str]:
@@ -337,7 +341,8 @@ class View:
             arrays["sweep_sensor"] = sweeps.sensor
             arrays["sweep_station"] = sweeps.station_numbers.astype(np.int32)
         pictured = self.pictured
-        object_count = len(self._names("object"))
+        objects = self._names("object") if pictured is None else pictured.scene.object_names
+        object_count = len(objects)
         static_count = object_count - len(self.actors)
         classes = self._classes_of_objects()
         result_numbers = np.arange(len(self.results))
@@ -446,9 +451,14 @@ class View:
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
-        """Return the class of each object, taken from one of its points in a sample."""
+        """Return the class of each object.
+
+        If it is not stated, it is taken from one of the object's points in a sample.
+        """
         if not {"object", "class"} <= self.columns.keys():
             return {}
+        if self.pictured is not None and self.pictured.object_classes is not None:
+            return dict(enumerate(self.pictured.object_classes.tolist()))
         rows, _ = self._finder.find_points(_SAMPLE)
         columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
         return dict(zip(*columns, strict=True))

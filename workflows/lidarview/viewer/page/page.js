@@ -668,6 +668,7 @@ function showClipBox(on) {
 
 // -- time --------------------------------------------------------------------------------
 
+const SAME_TIME_S = 1e-3; // the time is displayed in milliseconds
 let steps = []; // start times of the sweeps of displayed sensors, ascending
 let stationAt = new Map(); // {start time of a sweep: its station}
 const clock = {};
@@ -675,7 +676,17 @@ const clock = {};
 function buildSteps() {
   const shown = sweeps.filter((sweep) => picture.sensors[sweep.sensor]?.shown);
   stationAt = new Map(shown.map((sweep) => [sweep.begin, sweep.station]));
-  steps = [...stationAt.keys()].sort((a, b) => a - b);
+  const begins = [...stationAt.keys()].sort((a, b) => a - b);
+  // Sweeps of several sensors that start at almost the same time are one step, at the start of the last.
+  const gaps = picture.sensors.filter((sensor) => sensor.shown).flatMap(({ begins: own }) => [...own].map((begin, k) => begin - own[k - 1]).filter((gap) => gap > 0));
+  const slack = gaps.reduce((least, gap) => Math.min(least, gap / 2), SAME_TIME_S);
+  steps = [];
+  let first = -Infinity;
+  for (const begin of begins) {
+    if (begin - first < slack) steps.pop();
+    else first = begin;
+    steps.push(begin);
+  }
   if (!clock.ticks) return;
   if (stationary()) clock.slider.max = sliderEnd();
   drawTicks();
@@ -685,7 +696,7 @@ function buildSteps() {
 const stationary = () => state.stations.length > 0;
 const duration = () => Math.max(state.duration, 1e-9);
 const sliderEnd = () => (stationary() ? Math.max(steps.length - 1, 1) : duration());
-const stepNow = () => lastNotAbove(steps, chosen.time + 1e-9);
+const stepNow = () => Math.max(lastNotAbove(steps, chosen.time + 1e-9), 0);
 
 function buildTime() {
   const timed = sweeps.length > 0 && picture.sensors.length > 0;
@@ -802,7 +813,7 @@ function stepBy(count) {
   setPlaying(false);
   leaveAll();
   const index = stepNow();
-  const back = count < 0 && chosen.time - steps[Math.max(index, 0)] > 1e-6 ? 1 : 0;
+  const back = count < 0 && chosen.time - steps[index] > 1e-6 ? 1 : 0;
   setTime(steps[Math.min(Math.max(index + count + back, 0), steps.length - 1)]);
 }
 
@@ -1055,10 +1066,15 @@ async function news(told) {
     known.ends = told.ends;
     cache.clear();
     takeState(await ask("state"));
+    if (state.by_sweep && !clock.own) chosen.show = "sweep";
     picture.setTime(chosen.time);
     buildSteps();
     buildPanel();
     buildTime();
+    showPicked();
+    picture.resize(); // the player needs space
+    if (!picture.touched) look("all");
+    if (!$("time").hidden) tellTime();
     legendText = "";
     shownKey = null;
     refresh();
@@ -1084,6 +1100,7 @@ async function grow() {
   if (picture.touched) picture.shift(less(origin, state.origin));
   else picture.frame(state.box, state.arrays.corners, state.bounds); // the sample does not cover all of the cloud
   buildPanel();
+  showPicked();
   legendText = "";
   shownKey = null;
   refresh();
