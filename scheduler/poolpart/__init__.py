@@ -5,7 +5,7 @@ from ._version import __version__
 from .balance_stats import BalanceStats, DemandStats, WorkerMove
 from .balancing import BalancedGroup
 from .devices import own_device, own_device_share
-from .errors import PipeClosed, PipeFailed, PoolError
+from .errors import PipeClosed, PipeFailed, PoolError, TaskTimeoutError
 from .extras.background import after_all
 from .extras.cancelling import cancelled
 from .extras.listening import PipeListener
@@ -36,6 +36,7 @@ __all__ = [
     "StageStats",
     "TaskRow",
     "TaskTable",
+    "TaskTimeoutError",
     "WorkerInfo",
     "WorkerMove",
     "__version__",

@@ -11,3 +11,7 @@ class PipeClosed(Exception):  # noqa: N818 - not an error, like StopIteration
 
 class PipeFailed(RuntimeError):  # noqa: N818 - describes the state of the pipe
     """Raised by pipe methods if the pipe has failed. The message contains the reason."""
+
+
+class TaskTimeoutError(PoolError):
+    """Raised for a task that ran longer than its `timeout_s`."""

@@ -15,18 +15,19 @@ import reprlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, repeat
 from typing import Any, NoReturn
 
+import dask
 from dask.sizeof import sizeof
 from dask.utils import funcname
 from distributed import CancelledError, Client, Future, KilledWorker, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
-from .errors import PoolError
+from .errors import PoolError, TaskTimeoutError
 from .internals.client import call_when_done, gather, lend_slots
 from .map_lead import LeadTime
 from .membership import PartitionCapacity, request_capacity
@@ -222,6 +223,7 @@ class Stage:
     result_position: int = 0  # position of the argument that is the result of the previous stage
     by_rule: bool = False  # whether the partition can be dissolved
     empty_s: float = WAIT_S  # maximum time to wait without workers
+    annotations: dict[str, Any] = field(default_factory=dict)  # of the tasks
 
     def __post_init__(self) -> None:
         for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
@@ -248,27 +250,29 @@ class Stage:
         # Dask only retries tasks that fail, so errors must not become results if `retries` is set.
         keep_errors = self.return_exceptions and not self.retries
         # A single message for all tasks is cheaper for the scheduler than one message per task.
-        futures: list[Future] = self.client.map(
-            partial(
-                run_chunk,
-                self.function,
-                patience_s=patience_s,
-                result_position=self.result_position,
-                return_exceptions=keep_errors,
-            ),
-            firsts,
-            calls,
-            # Keyword arguments are passed as a positional argument, so that futures among them are
-            # replaced by their results. Dask's own keyword arguments share a key if they are large.
-            [self.keywords] * len(firsts),
-            *([previous_tasks] if previous_tasks else []),
-            # Dask derives the prefix from the first word and further words that only have letters.
-            key=f"{funcname(self.function)}-map",
-            pure=False,
-            priority=self.priority,
-            retries=self.retries or None,
-            resources={self.partition: self.slots},
-        )
+        with dask.annotate(**self.annotations) if self.annotations else nullcontext():
+            futures: list[Future] = self.client.map(
+                partial(
+                    run_chunk,
+                    self.function,
+                    patience_s=patience_s,
+                    result_position=self.result_position,
+                    return_exceptions=keep_errors,
+                ),
+                firsts,
+                calls,
+                # Keyword arguments are passed as a positional argument, so that futures among them
+                # are replaced by their results. Dask's own keyword arguments share a key if they
+                # are large.
+                [self.keywords] * len(firsts),
+                *([previous_tasks] if previous_tasks else []),
+                # Dask derives the prefix from the first word and further words of letters only.
+                key=f"{funcname(self.function)}-map",
+                pure=False,
+                priority=self.priority,
+                retries=self.retries or None,
+                resources={self.partition: self.slots},
+            )
         return futures
 
 
@@ -597,7 +601,7 @@ class Results(Iterator[Any]):
                 if isinstance(error, KilledWorker) and len(chunk.rows) > 1:
                     heapq.heappush(self._unfinished, (first, chunk.rows, 1))  # to find the item
                     continue
-                if isinstance(error, KilledWorker):
+                if isinstance(error, KilledWorker | TaskTimeoutError):
                     _add_note(error, chunk)
                 if not (self._stages[-1].return_exceptions and _is_item_error(error)):
                     self._failed = chunk, answer
@@ -622,13 +626,16 @@ class Results(Iterator[Any]):
         raise AssertionError("the task has not failed")
 
 
-def _add_note(error: KilledWorker, chunk: Chunk) -> None:
-    """Name the only item of a task whose workers have died."""
+def _add_note(error: KilledWorker | TaskTimeoutError, chunk: Chunk) -> None:
+    """Name the only item of a task whose workers have died, or that took too long."""
     shown = ", ".join(reprlib.repr(argument) for call in chunk.rows[0] for argument in call)
-    error.add_note(
-        f"{NOTE}Workers died while they processed item {chunk.first} of a map: {shown}. If workers "
-        "run several tasks at a time, another task may be the cause."
-    )
+    note = f"The error occurred for item {chunk.first} of a map: {shown}"
+    if isinstance(error, KilledWorker):
+        note = (
+            f"Workers died while they processed item {chunk.first} of a map: {shown}. If workers "
+            "run several tasks at a time, another task may be the cause."
+        )
+    error.add_note(NOTE + note)
 
 
 def _worker_wait(stage: Stage) -> WorkerWait:

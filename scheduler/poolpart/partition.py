@@ -33,6 +33,7 @@ from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
 from .internals.names import CANCELLING, CLIENTS, MAP, require_feature
 from .internals.partition_client import PartitionClient, entered_partitions, whole_client
+from .limits import timeout_annotation
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
@@ -211,6 +212,7 @@ class Partition:
         retries: int = 0,
         slots: int = 1,
         workers: str | int | Sequence[str | int] | None = None,
+        timeout_s: float | None = None,
         **kwargs: Any,
     ) -> Future:
         """Submit a task to this partition's workers.
@@ -236,6 +238,13 @@ class Partition:
             Name or address of the member that runs the task, or a list of them. Names are resolved
             to addresses when the task reaches the scheduler. If these workers leave or restart, the
             task waits forever.
+        timeout_s
+            Maximum running time in seconds, without the time before the task starts. A task that
+            runs longer fails with `TaskTimeoutError`, or runs again on another worker if it has
+            `retries` left. It is checked about twice a second. If the function does not return
+            within 5 s, for example because it does not check `cancelled`, its worker is restarted
+            under the conditions of ``cancel(running="restart")``, as soon as other tasks on the
+            worker have finished, but at most after a minute.
 
         Returns
         -------
@@ -247,7 +256,7 @@ class Partition:
         Raises
         ------
         ValueError
-            If `slots` is below 1.
+            If `slots` is below 1, or if `timeout_s` is not positive.
         PoolError
             If the function is a coroutine function, or if a Dask option is passed that the
             partition sets itself. Unless the client is asynchronous, its first call waits for a
@@ -272,8 +281,10 @@ class Partition:
                 )
             # Names are converted to strings, because LocalCluster uses integers.
             workers = [MemberName(name) if asks else str(name) for name in several]
-        pipes = _names_of_pipes([*args, *kwargs.values()])
-        with dask.annotate(**{USES_PIPES: pipes}) if pipes else nullcontext():
+        annotations: dict[str, Any] = timeout_annotation(timeout_s)
+        if pipes := _names_of_pipes([*args, *kwargs.values()]):
+            annotations[USES_PIPES] = pipes
+        with dask.annotate(**annotations) if annotations else nullcontext():
             return self.client.submit(
                 function,
                 *args,
@@ -313,6 +324,7 @@ class Partition:
         slots: int = 1,
         return_exceptions: bool = False,
         empty_s: float = WAIT_S,
+        timeout_s: float | None = None,
         **kwargs: Any,
     ) -> Results:
         """Call a function for each item, and return an iterator over the results.
@@ -358,6 +370,9 @@ class Partition:
         empty_s
             Maximum time in seconds to wait while the partition has no workers, and no worker is
             starting, queued or requested by `adapt`. Pass `math.inf` to wait forever.
+        timeout_s
+            Maximum running time of each item in seconds, as in `submit`. Each task then has one
+            item, as with ``chunk=1``.
         kwargs
             Keyword arguments that are passed to each call. Use `functools.partial` for arguments
             that have the name of an option. Scatter large arguments and pass the futures.
@@ -377,7 +392,8 @@ class Partition:
         Raises
         ------
         ValueError
-            If `window`, `chunk` or `slots` is below 1, or if `retries` or `empty_s` is below 0.
+            If `window`, `chunk` or `slots` is below 1, if `retries` or `empty_s` is below 0, if
+            `timeout_s` is not positive, or if it is combined with a `chunk` above 1.
         PoolError
             If the partition was dissolved, if the function is a coroutine function, or if `pure` or
             `resources` is passed.
@@ -391,13 +407,18 @@ class Partition:
         _check_function(self.name, function)
         _refuse_options("map", kwargs, **_OF_MAPS)
         self._resources_for(slots)
+        if timeout_s is not None and chunk not in (None, 1):
+            raise ValueError(
+                f"`chunk={chunk!r}` cannot be combined with `timeout_s`, which limits the running "
+                "time of each item. Remove `chunk`."
+            )
         stage = Stage(
             self.client,
             self.name,
             function,
             ordered=ordered,
             window=window,
-            chunk=chunk,
+            chunk=chunk if timeout_s is None else 1,
             priority=priority,
             retries=retries,
             slots=slots,
@@ -405,6 +426,7 @@ class Partition:
             keywords=kwargs,
             by_rule=self.by_rule,
             empty_s=empty_s,
+            annotations=timeout_annotation(timeout_s),
         )
         return Results(stage, iterables)
 
@@ -442,6 +464,7 @@ class Partition:
         retries: int = 0,
         slots: int = 1,
         empty_s: float = WAIT_S,
+        timeout_s: float | None = None,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
         """Run a task for each item of a pipe or iterable.
@@ -468,7 +491,7 @@ class Partition:
             Maximum number of tasks in flight. By default, it is two for each slot that is not the
             share of other clients, and increases to up to 16 for each slot if slots become idle
             before this process can submit further tasks. It adapts to the number of slots.
-        priority, retries, slots
+        priority, retries, slots, timeout_s
             Options of each task, as in `submit`.
         empty_s
             Maximum time in seconds that tasks wait while the partition has no workers, as in `map`.
@@ -504,7 +527,9 @@ class Partition:
         >>> casting.result()                                             # doctest: +SKIP
         36
         """
+        timeout_annotation(timeout_s)  # raises an error here rather than in a thread
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
+        options["timeout_s"] = timeout_s
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._resources_for(slots)

@@ -193,6 +193,19 @@ async def free_worker(
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
 
 
+async def await_end(scheduler: Any, worker: Any, key: Any, seconds: float) -> bool:
+    """Wait until a worker no longer runs a task, and return whether this was within the time."""
+    deadline = time.monotonic() + seconds
+    while scheduler.workers.get(worker.address) is worker:
+        load = await _load(scheduler, worker)
+        if load is not None and key not in load.running:
+            return True
+        if time.monotonic() > deadline:
+            return False
+        await asyncio.sleep(_CHECK_S)
+    return True
+
+
 async def _hand_over(scheduler: Any, worker: Any, name: str, candidates: Set[Any]) -> _Load | None:
     """Move a worker's waiting tasks to other workers, and return its load afterwards."""
     load = await _load(scheduler, worker)

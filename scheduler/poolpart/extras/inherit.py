@@ -48,12 +48,14 @@ from ..internals.names import (
     NESTED,
     READING,
     SHUFFLES,
+    WATCHING,
     require_feature,
 )
 from ..internals.scheduler import Resources, set_worker_plugin
 from .blaming import DeathBlame
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
+from .watching import TaskWatch
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +76,7 @@ class Inheritance(SchedulerPlugin):
         self._choice: WorkerChooser | None = None
         self._unreadable: UnreadableInputs | None = None
         self._blame: DeathBlame | None = None
+        self._task_watch: TaskWatch | None = None
         self.lends = self._enable_part(
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
         )
@@ -89,6 +92,9 @@ class Inheritance(SchedulerPlugin):
         )
         self._enable_part(
             BLAMING, "The death of a worker counts against all of its tasks.", self._acquit
+        )
+        self._enable_part(
+            WATCHING, "Tasks may wait on a worker while others have free slots.", self._watch
         )
         scheduler.add_plugin(self)
 
@@ -124,6 +130,14 @@ class Inheritance(SchedulerPlugin):
     def _acquit(self) -> None:
         self._blame = DeathBlame(self.scheduler, self.names)
 
+    def _watch(self) -> None:
+        self._task_watch = TaskWatch(self.scheduler, self.names)
+
+    async def close(self) -> None:
+        """Stop the periodic checks when the scheduler closes."""
+        if self._task_watch is not None:
+            self._task_watch.close()
+
     def _inherited_resources(self, task: Any) -> Resources:
         """Return the resources that nested tasks inherit from a task, empty outside partitions."""
         resources = task.resource_restrictions
@@ -138,6 +152,8 @@ class Inheritance(SchedulerPlugin):
             self._unreadable.uninstall()
         if self._blame is not None:
             self._blame.uninstall()
+        if self._task_watch is not None:
+            self._task_watch.uninstall()
         self.scheduler.remove_plugin(NAME)
 
 

@@ -41,6 +41,7 @@ CLIENTS = "Partition.as_client"
 BALANCING = "Pool.balance"
 BLAMING = "blaming the death of a worker on running tasks only"
 SHARES = "fair shares"
+WATCHING = "moving waiting tasks to free slots, and time limits of tasks"
 READING = "errors for inputs that cannot be unpickled"
 
 
@@ -436,6 +437,30 @@ PRIVATE_NAMES = (
         ),
         "count the death of a worker only against tasks that may have been running",
         ("test_deaths.py::test_only_running_tasks_are_blamed",),
+    ),
+    PrivateNames(
+        WATCHING,
+        (
+            f"{_STEALING}.move_task_request(ts, victim, thief)",
+            f"{_STEALING}.in_flight",
+            f"{_SCHEDULER}.valid_workers(ts)",
+            f"{_SCHEDULER}.running",
+            f"{_SCHEDULER}.handle_task_erred(key, stimulus_id)",
+            f"{_SCHEDULER}.handle_worker_status_change",
+            f"{_SCHEDULER_TASK}.priority",
+            f"{_SCHEDULER_TASK}.annotations",
+            f"{_SCHEDULER_TASK}.run_id",
+            f"{_SCHEDULER_WORKER}.executing",
+            f"{_SCHEDULER_WORKER}.long_running",
+            f"{_SCHEDULER_WORKER}.last_seen",
+            f"{_SCHEDULER_WORKER}.processing",
+            f"{_SCHEDULER_WORKER}.used_resources",
+        ),
+        "move tasks that wait behind others, and end tasks that run too long",
+        (
+            "test_watching.py::test_tasks_do_not_wait_while_another_slot_is_free",
+            "test_watching.py::test_a_task_that_takes_too_long_fails",
+        ),
     ),
 )
 

@@ -125,6 +125,11 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 # -- running tasks -------------------------------------------------------------------------
 
 
+def reported_tasks(worker: Any) -> set[Any]:
+    """Return the tasks that a worker runs according to its last heartbeat, or that have seceded."""
+    return (worker.executing.keys() & worker.processing) | worker.long_running
+
+
 def running_candidates(worker: Any) -> set[Any]:
     """Return the tasks that a worker runs, or may run, as far as the scheduler knows.
 
@@ -132,7 +137,7 @@ def running_candidates(worker: Any) -> set[Any]:
     remaining slots the tasks with the highest priority. A task that has seceded may have lent its
     slots.
     """
-    running = (worker.executing.keys() & worker.processing) | worker.long_running
+    running = reported_tasks(worker)
     free = dict(worker.resources)
     threads = worker.nthreads
     for task in running - worker.long_running:
@@ -203,6 +208,17 @@ def hand_off_tasks(
             thief = min(candidates, key=lambda w: (len(w.processing) + moving[w]) / w.nthreads)
             moving[thief] += 1
             stealing.move_task_request(task, worker, thief)
+
+
+def accepts_moves(scheduler: Any, task: Any) -> bool:
+    """Return whether a task can be moved, and is not being moved already."""
+    stealing = scheduler.extensions.get("stealing")
+    return stealing is not None and task not in stealing.in_flight and not task.actor
+
+
+def move_task(scheduler: Any, task: Any, target: Any) -> None:
+    """Ask the worker of a task to give it up to another worker, unless it has started the task."""
+    scheduler.extensions["stealing"].move_task_request(task, task.processing_on, target)
 
 
 # -- closing idle workers -----------------------------------------------------------------

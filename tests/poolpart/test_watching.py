@@ -1,0 +1,118 @@
+"""Tasks do not wait behind others while a slot is free, and end if they take too long."""
+
+import os
+import time
+
+import pytest
+from distributed import Event, get_worker
+from distributed.core import Status
+from tests.poolpart.helpers import LONG_S, wait_for, worker_name
+
+from poolpart import Partition, Pool, TaskTimeoutError, cancelled
+
+
+@pytest.fixture
+def event(request):
+    """Return a function that makes an event with a new name."""
+    return lambda client: Event(f"watching-{os.urandom(4).hex()}", client)
+
+
+def set_and_wait(started, release):
+    Event(started).set()
+    wait_for(release)
+    return worker_name()
+
+
+@pytest.mark.parametrize("why", ["long", "paused", "canceled"])
+def test_tasks_do_not_wait_while_another_slot_is_free(start, event, wait_until, why):
+    """In plain Dask, they wait for a canceled task, and the scheduler miscounts moved tasks."""
+    client = start({"x": {"resources": {"A": 1}}, "y": {"resources": {"A": 1}}})
+    scheduler = client.cluster.scheduler
+    part = Partition("A", client)
+    client.gather([part.submit(worker_name) for _ in range(20)])
+    started, release, gate = event(client), event(client), event(client)
+    long = part.submit(set_and_wait, started.name, release.name, workers="x")
+    other = part.submit(wait_for, gate.name, workers="y")
+    assert started.wait(LONG_S)
+    waiting = [part.submit(worker_name) for _ in range(6)]
+    wait_until(lambda: all(f.key in scheduler.tasks for f in waiting))
+    assert {scheduler.tasks[future.key].processing_on.name for future in waiting} == {"x", "y"}
+    if why == "paused":
+        client.cluster.workers["x"].status = Status.paused
+    if why == "canceled":
+        long.cancel()
+    gate.set()
+    assert client.gather(waiting) == ["y"] * 6
+    if why == "canceled":  # the scheduler assumes that both workers are free
+        assert client.gather([part.submit(worker_name) for _ in range(4)]) == ["y"] * 4
+    client.cluster.workers["x"].status = Status.running
+    release.set()
+    assert other.result(LONG_S)
+    assert why == "canceled" or long.result(LONG_S) == "x"
+    x, y = scheduler.workers.values()
+    wait_until(lambda: (x.used_resources["A"], y.used_resources["A"]) == (0, 0))
+
+
+def until_cancelled(name):
+    while not cancelled():
+        time.sleep(0.01)
+    Event(name).set()
+
+
+def sleep_if_odd(number):
+    time.sleep(number % 2 * 3600)
+    return number
+
+
+def test_a_task_that_takes_too_long_fails(client, b, event):
+    ended = event(client)
+    future = b.submit(until_cancelled, ended.name, timeout_s=0.3)
+    waits = b.submit(abs, -1, timeout_s=0.3)  # the time before it starts does not count
+    with pytest.raises(TaskTimeoutError) as caught:
+        future.result(LONG_S)
+    message = str(caught.value)
+    assert message.startswith(f"Task '{future.key}' ran for ")
+    assert message.endswith("s on worker B-0. Its limit is 0.3 s (`timeout_s`).")
+    assert ended.wait(LONG_S)
+    assert waits.result(LONG_S) == 1
+    with pytest.raises(TaskTimeoutError) as caught:
+        b.for_each([ended.name], until_cancelled, timeout_s=0.3)
+    assert caught.value.__notes__[0].startswith("poolpart: The error occurred for item 0 of the it")
+    with pytest.raises(TaskTimeoutError) as caught:
+        list(b.map(until_cancelled, [ended.name], timeout_s=0.3))
+    assert caught.value.__notes__[0].startswith("poolpart: The error occurred for item 0 of a map")
+
+
+@pytest.mark.parametrize("limit", [0, -1, True, "3", float("nan")])
+def test_limits_that_mean_nothing_are_refused(b, limit):
+    for method, arguments in (("submit", ()), ("map", ([],)), ("for_each", ([],))):
+        function_and_items = (*arguments, abs) if method == "for_each" else (abs, *arguments)
+        with pytest.raises(ValueError, match="Expected a positive number of seconds"):
+            getattr(b, method)(*function_and_items, timeout_s=limit)
+
+
+def test_a_limit_per_item_and_chunks_are_refused(b):
+    with pytest.raises(ValueError, match="`chunk=2` cannot be combined with `timeout_s`"):
+        b.map(abs, [], chunk=2, timeout_s=1)
+
+
+def test_a_worker_that_does_not_return_is_restarted(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    results = [*both.map(sleep_if_odd, range(4), timeout_s=0.5, return_exceptions=True)]
+    assert [type(result) for result in results] == [int, TaskTimeoutError, int, TaskTimeoutError]
+    assert results[1].__notes__ == ["poolpart: The error occurred for item 1 of a map: 1"]
+    assert both.submit(abs, -2).result(LONG_S) == 2
+
+
+def hang_on(name):
+    if str(get_worker().name) == name:
+        time.sleep(3600)
+    return str(get_worker().name)
+
+
+def test_with_retries_it_runs_on_another_worker(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    futures = [both.submit(hang_on, "1", timeout_s=0.5, retries=1) for _ in range(4)]
+    assert nannies.gather(futures) == ["0"] * 4
