@@ -29,14 +29,17 @@ def test_tasks_do_not_wait_while_another_slot_is_free(start, event, wait_until, 
     client = start({"x": {"resources": {"A": 1}}, "y": {"resources": {"A": 1}}})
     scheduler = client.cluster.scheduler
     part = Partition("A", client)
-    client.gather([part.submit(worker_name) for _ in range(20)])
     started, release, gate = event(client), event(client), event(client)
+    release.set()  # so that tasks are expected to be short, and are assigned in advance
+    client.gather([part.submit(set_and_wait, started.name, release.name) for _ in range(20)])
+    release.clear()
+    started.clear()
     long = part.submit(set_and_wait, started.name, release.name, workers="x")
     other = part.submit(wait_for, gate.name, workers="y")
     assert started.wait(LONG_S)
     waiting = [part.submit(worker_name) for _ in range(6)]
-    wait_until(lambda: all(f.key in scheduler.tasks for f in waiting))
-    assert {scheduler.tasks[future.key].processing_on.name for future in waiting} == {"x", "y"}
+    x = scheduler.workers[client.cluster.workers["x"].address]
+    wait_until(lambda: any(task.key in {f.key for f in waiting} for task in x.processing))
     if why == "paused":
         client.cluster.workers["x"].status = Status.paused
     if why == "canceled":
@@ -49,8 +52,7 @@ def test_tasks_do_not_wait_while_another_slot_is_free(start, event, wait_until, 
     release.set()
     assert other.result(LONG_S)
     assert why == "canceled" or long.result(LONG_S) == "x"
-    x, y = scheduler.workers.values()
-    wait_until(lambda: (x.used_resources["A"], y.used_resources["A"]) == (0, 0))
+    wait_until(lambda: all(w.used_resources["A"] == 0 for w in scheduler.workers.values()))
 
 
 def until_cancelled(name):
