@@ -10,14 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweep, Alignment
 from lidarpool.reconstruction.blocked_directions import PulseCounts
 from lidarpool.reconstruction.free_space import RangeImage, locate
 from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
 from lidarpool.reconstruction.motion import Motion, MotionStep
+from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.porosity import Crossings, Porosity
 from lidarpool.reconstruction.range_noise import RingNeighbors
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.reflectances import (
     IntensityModel,
     Response,
@@ -27,12 +30,14 @@ from lidarpool.reconstruction.reflectances import (
 from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
 from lidarpool.reconstruction.surface_map import Observations, SurfaceMap, median_shifts
 from lidarpool.reconstruction.surfels import Surfels, principal_axes, surfel_mesh
+from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarpool.reconstruction.vehicle_returns import VehicleReturns
 from lidarpool.reconstruction.visibility import estimate_visibility
 from lidarpool.scan_patterns.lasers import RingLasers
 from lidarpool.scenario.point_scene import CLASS_MATERIAL
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.materials import extinction
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.face_materials import FaceMaterials
 
 pytest.importorskip("scipy")
@@ -443,12 +448,18 @@ def test_each_object_has_its_surfels_and_each_class_its_material():
     names = [f"{CLASS_MATERIAL}{label}" if label else "" for label in labels]
     distinct = tuple(dict.fromkeys(names))
     index = np.array([distinct.index(name) for name in names], np.int32).repeat(2)
-    mesh = replace(surfels.mesh, materials=FaceMaterials(distinct, index))
+    grays = (
+        np.repeat([10, 20, 30, 40, 50], 2)[:, None].repeat(3, axis=1) + np.tile([0, 1], 5)[:, None]
+    )
+    colors = Colors.from_face_colors(grays.astype(np.uint8))
+    mesh = replace(surfels.mesh, materials=FaceMaterials(distinct, index), colors=colors)
     porosity = Porosity(np.array([0, 0.4, 0, 0, 0]), np.array([0, 0.06, 0, 0, 0]))
     parts = split_by_object(mesh, porosity, np.array([0, 0, 0.3, 0, 0]))
     assert [part.name for part in parts] == ["object 0", "object 3", "plates"]
     distances = [part.vertices.reshape(-1, 4, 3)[:, 0, 0].tolist() for part in parts]
     assert distances == [[40], [30], [10, 20, 50]]
+    shown = [part.colors.corners[:, 0, 0].tolist() for part in parts]
+    assert shown == [[40, 41], [30, 31], [10, 11, 20, 21, 50, 51]]
     assert parts[0].materials is None
     found = SurfelMaterial.from_name(parts[1].materials.names[0])
     assert found == SurfelMaterial(7, 0.0, 0.0, 0.3)
@@ -502,3 +513,51 @@ def test_overlapping_submaps_are_blended_with_their_rotations():
     assert set(merged.plane_distance_m.tolist()) == {0.005, 0.007}
     step = MotionStep.between(merged.poses[0], merged.poses[1])
     np.testing.assert_allclose(step.translation, [0.5, -0.1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("speed_m", [0.6, -0.6, 0.0])
+def test_only_what_moves_with_the_sensor_is_the_vehicle(speed_m):
+    """A bonnet in front on the left and a post beside the road, in a street between walls."""
+    elevation = np.radians(np.linspace(8, -24, 24))
+    azimuth = np.radians(np.arange(-179.75, 180, 0.5))
+    ring, column = (part.ravel() for part in np.indices((24, len(azimuth))))
+    vectors = np.stack(
+        [np.cos(elevation[ring]) * np.cos(azimuth[column]),
+         np.cos(elevation[ring]) * np.sin(azimuth[column]), np.sin(elevation[ring])], axis=1,
+    )  # fmt: skip
+    degrees = np.degrees(azimuth[column])
+    is_bonnet = (ring >= 18) & (degrees > 20) & (degrees < 50)
+
+    def read(number):
+        with np.errstate(divide="ignore"):
+            wall_m = np.where(vectors[:, 1] > 0, 9, -6) / vectors[:, 1]
+            ground_m = np.where(vectors[:, 2] < 0, -1.8 / vectors[:, 2], np.inf)
+        range_m = np.minimum(np.minimum(wall_m, ground_m), 60)
+        # A post of 0.6 m is 3 m to the right of the path at x = 4.
+        x = 4 - speed_m * number
+        apart = x * np.sin(azimuth[column]) + 3 * np.cos(azimuth[column])
+        along = (x * np.cos(azimuth[column]) - 3 * np.sin(azimuth[column])) / np.cos(
+            elevation[ring]
+        )
+        range_m = np.where((np.abs(apart) < 0.3) & (along > 0), np.minimum(range_m, along), range_m)
+        range_m = np.where(is_bonnet, 1.5 + 0.01 * np.sin(number), range_m)
+        order = np.lexsort((ring, column))
+        return Sweep((range_m[:, None] * vectors)[order], {"ring": ring[order]})
+
+    recorded = RecordedSweeps.from_recording(Recording("street", 26, read))
+    poses = np.tile(np.eye(4), (26, 1, 1))
+    poses[:, 0, 3] = speed_m * np.arange(26)
+    given = RecordedPoses(poses, 0.1 * np.arange(26), "given", np.zeros(3))
+    vehicle = find_vehicle_returns(recorded, given)
+    if not speed_m:
+        assert not vehicle.are_found, "a sensor that stands sees everything in the same place"
+        return
+    sweep = recorded.read(9)
+    found = vehicle.contain(sweep)
+    at = np.degrees(np.arctan2(sweep.points[:, 1], sweep.points[:, 0]))
+    truth = np.linalg.norm(sweep.points, axis=1) < 1.6
+    assert truth.sum() == is_bonnet.sum()
+    assert found[truth].all()
+    # Cells next to the bonnet are its edge, up to its range.
+    assert not found[~truth].any(), at[found & ~truth]
+    assert vehicle.share == pytest.approx(is_bonnet.mean(), rel=0.02)

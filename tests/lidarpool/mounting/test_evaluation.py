@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from lidarpool import LidarError, Pose
+from lidarpool import LidarError, Pose, Scene, SceneMesh, box
 from lidarpool.mounting.placements import azimuths_in_view, pack_sweeps
 from lidarpool.mounting.study import MountStudy
 from lidarpool.scenario.mount_sections import VehicleFile
+from lidarscenes.writers.scene_file import write_scene
 
 POST = {"box": [0.2, 0.2, 0.2]}  # a body that hides almost nothing
 PLATE = {"box": [0.5, 1.2, 1.8]}
@@ -94,6 +95,15 @@ def test_a_ring_meets_level_ground_at_its_height_over_the_tangent(folder):
         seen_m2 = result.map_m2 - result.blind_m2[height]
         assert 0.98 < seen_m2 / (0.01 * visible.sum()) <= 1  # few corners are between two beams
         assert seen_m2 == pytest.approx(math.pi * (radius**2 - inner**2), rel=0.07)
+
+
+def test_only_a_body_below_the_ground_is_noted(folder):
+    assert study(folder).notes == ()
+    low = box("van", (4, 2, 1.5))
+    low = SceneMesh("van", low.vertices - np.array([0, 0, 0.75]), low.faces)
+    write_scene(folder / "low.glb", Scene.from_meshes([low]))
+    (note,) = study(folder, body="low.glb").notes
+    assert note.startswith("the body extends to z = -0.75 m, but the ground is z = 0")
 
 
 def test_the_edge_of_a_roof_hides_the_ground_behind_it(folder):
