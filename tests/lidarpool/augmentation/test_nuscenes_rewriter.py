@@ -97,6 +97,42 @@ def test_points_and_labels(drive, tmp_path):
         np.testing.assert_array_equal(labels[~added], old[expected.template[~added]])
 
 
+@pytest.mark.parametrize("has_panoptic", [False, True])
+def test_several_new_categories(drive, tmp_path, has_panoptic):
+    """Their order differs between sweeps, which are encoded independently of each other."""
+    source = tmp_path / "source"
+    shutil.copytree(drive, source)
+    if has_panoptic:
+        panoptic_labels(source)
+    rewriter = opened(source)
+    kinds = [("hoverboard", "walker"), ("walker", "Car"), ("walker", "hoverboard")]
+
+    def augment(recording, number):
+        augmented = with_objects(recording, number)
+        boxes = replace(augmented.boxes, types=kinds[number], names=kinds[number])
+        return replace(augmented, boxes=boxes)
+
+    new = tmp_path / "new"
+    notes = rewrite(rewriter, new, tmp_path / "work", augment)
+    assert "These categories were added for inserted objects: hoverboard, walker." in notes
+    categories = {row["name"]: row["index"] for row in tables_of(new)["category"].values()}
+    assert categories == {"none": 0, "road": 1, "Car": 2, "Van": 3, "hoverboard": 4, "walker": 5}
+    for number, names in enumerate(kinds):
+        expected = augment(rewriter.recording, number)
+        added = ~expected.is_recorded
+        own = expected.sweep.columns["object"][added] - 50
+        wanted = np.array([categories[name] for name in names])[own]
+        stem = f"{VERSION}/samples-LIDAR_TOP-{number:06}"
+        labels = np.fromfile(new / f"lidarseg/{stem}.pcd.bin", "u1")
+        np.testing.assert_array_equal(labels[added], wanted)
+        if has_panoptic:
+            with np.load(new / f"panoptic/{stem}.pcd.npz") as archive:
+                np.testing.assert_array_equal(archive["data"][added] // 1000, wanted)
+    instances = tables_of(new)["instance"].values()
+    by_category = [row["category_token"] for row in instances if row["nbr_annotations"] > 0]
+    assert len(by_category) == len(tables_of(drive)["instance"]) + 3
+
+
 def points_in_box(row, points):
     """Return the number of points in an annotation, by the rule of nuscenes-devkit."""
     w, x, y, z = row["rotation"]
@@ -192,9 +228,8 @@ def test_counts_of_recorded_boxes(drive, tmp_path):
     assert any(note.startswith("`num_lidar_pts` was updated in") for note in notes)
 
 
-def test_panoptic_labels(drive, tmp_path):
-    source = tmp_path / "source"
-    shutil.copytree(drive, source)
+def panoptic_labels(source):
+    """Add panoptic labels to a data set, and return their table."""
     tables = tables_of(source)
     rows = []
     for token, row in tables["lidarseg"].items():
@@ -204,6 +239,13 @@ def test_panoptic_labels(drive, tmp_path):
         np.savez_compressed(source / name, data=1000 * labels + 7)
         rows.append({"token": token, "sample_data_token": token, "filename": name})
     (source / VERSION / "panoptic.json").write_text(json.dumps(rows))
+    return rows
+
+
+def test_panoptic_labels(drive, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(drive, source)
+    rows = panoptic_labels(source)
     new = tmp_path / "new"
     rewriter = opened(source)
     rewrite(rewriter, new, tmp_path / "work", with_objects)

@@ -12,7 +12,9 @@ from lidarpool.augmentation.resampling import SensorResampler
 from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 
-ROOM_M = np.array([20.0, 12.0, 5.0])  # half of the sides
+# Distances of the walls, the floor and the ceiling from the sensor, which is not in the center.
+BEHIND_M = np.array([15.0, 12.0, 4.0])
+AHEAD_M = np.array([20.0, 9.0, 5.0])
 DENSE = Sensor.grid(720, 31, vertical_fov_deg=30)  # 0.5 by 1 degrees
 SPARSE = Sensor.grid(240, 16, vertical_fov_deg=30)  # 1.5 by 2 degrees
 PITCH = np.radians(4)
@@ -26,9 +28,10 @@ def rays(sensor):
 
 
 def scan_room(sensor):
-    """Return a sweep in the center of a room, in which each pulse has a return."""
+    """Return a sweep in a room, in which each pulse has a return."""
     directions = rays(sensor)
-    range_m = (ROOM_M / np.abs(directions).clip(min=1e-12)).min(axis=1)
+    walls_m = np.where(directions > 0, AHEAD_M, BEHIND_M)
+    range_m = (walls_m / np.abs(directions).clip(min=1e-12)).min(axis=1)
     columns = {
         "channel": (np.arange(len(directions)) % sensor.channels).astype(np.uint16),
         "intensity": np.arange(len(directions), dtype=np.float32),
@@ -78,7 +81,9 @@ def test_closest_pulses_are_at_most_half_of_the_recorded_spacing_away(dense):
     up_deg, _ = angles_deg(augmented.sweep.points, augmented.sweep.columns["channel"], other)
     assert up_deg.max() < 32 / 46 / 2 + 1e-6
     # The walls are planes, so each point lies exactly on one of them.
-    assert np.allclose((np.abs(augmented.sweep.points) / ROOM_M).max(axis=1), 1)
+    points = augmented.sweep.points
+    walls_m = np.where(points > 0, AHEAD_M, BEHIND_M)
+    assert np.allclose((np.abs(points) / walls_m).max(axis=1), 1)
 
 
 def test_pulses_without_a_return_stay_without_one(dense):
@@ -186,6 +191,28 @@ def test_a_sector_of_the_field_of_view(dense):
     augmented = SensorResampler(recording(dense), sector).sweep(0)
     assert len(augmented.sweep) == 80 * 16
     assert (augmented.sweep.points[:, 0] > 0).all()
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_blocked_directions_of_the_other_sensor_have_no_points(dense, clockwise):
+    """Each channel has its own sectors, one of which contains the direction behind the sensor."""
+    head = replace(SPARSE.head, clockwise=clockwise)
+    sectors_deg = np.array([[20.2, 80.2], [170.2, -175.3], [10.2, 30.2], [-90.3, -60.3]])
+    blocked = np.column_stack([[0, 2, 2, 15], np.radians(sectors_deg)])
+    free = replace(SPARSE, head=head)
+    platform = replace(free, beams=replace(free.beams, blocked=blocked))
+    resampled = [SensorResampler(recording(dense), sensor).sweep(0) for sensor in (free, platform)]
+    expected, found = (
+        {*zip(one.template.tolist(), one.sweep.columns["channel"].tolist(), strict=True)}
+        for one in resampled
+    )
+    points, channel = resampled[0].sweep.points, resampled[0].sweep.columns["channel"]
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    hidden = np.zeros(len(azimuth), bool)
+    for beam, (first, last) in zip((0, 2, 2, 15), sectors_deg.tolist(), strict=True):
+        hidden |= (channel == beam) & ((azimuth - first) % 360 < (last - first) % 360)
+    kept = {*zip(resampled[0].template[~hidden], channel[~hidden].tolist(), strict=True)}
+    assert found == kept and len(expected) - len(found) == hidden.sum() > 50
 
 
 def test_partial_omits_what_was_not_recorded(dense):
