@@ -9,11 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidarpool.clouds.recording import Recording
+from lidarpool.reconstruction.air_returns import AirStatistics, find_air_returns
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarpool.reconstruction.blocked_directions import BlockedDirections
 from lidarpool.reconstruction.lost_pulses import SensorCoverage, firings_per_turn, lost_pulses
 from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.moving_rays import TimedPulses
+from lidarpool.reconstruction.moving_rays import TimedPulses, collect_moving_rays
+from lidarpool.reconstruction.object_tracks import ObjectTrack
 from lidarpool.reconstruction.recorded_sensor import SweepTiming
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps, ring_starts
 from lidarpool.reconstruction.reflectances import IntensityModel, Response
@@ -205,3 +207,87 @@ def test_pulses_have_the_times_and_places_of_their_firings():
     returns, both = hidden.read_pulses(1)
     np.testing.assert_array_equal(returns.is_blocked, returns.ring == 0)
     np.testing.assert_array_equal(both.is_blocked, both.ring == 0)
+
+
+def test_rays_are_collected_near_what_moves_before_it_starts_and_after_it_stops():
+    sweeps = aligned(recorded(count=7), PERIOD_S * np.arange(7), Motion.TIMED)
+    azimuth_deg, elevation_deg = [], []
+    stationary = {}
+    for number in range(7):
+        points = sweeps.read(number).points
+        azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+        elevation_deg = np.degrees(np.arctan2(points[:, 2], np.hypot(*points[:, :2].T)))
+        moves = (np.abs(azimuth_deg + 30) < 3) & (np.abs(elevation_deg) < 5) & (2 <= number <= 4)
+        stationary[number] = ~moves
+    rays = collect_moving_rays(sweeps, stationary, [0, 3, 6], [])
+    assert set(rays.sweep.tolist()) == {0, 3, 6}
+    for number in (0, 3, 6):
+        part = rays.select(rays.sweep == number)
+        toward = part.ends - part.origins
+        at_deg = np.degrees(np.arctan2(toward[:, 1], toward[:, 0]))
+        # Half a meter at 12 m is 2.4 degrees.
+        assert np.abs(at_deg + 30).max() < 8
+        near = (np.abs(azimuth_deg + 30) < 4) & (np.abs(elevation_deg) < 5)
+        assert len(part.sweep) > near.sum()
+        assert part.returned.all()
+        moved = (np.abs(at_deg + 30) < 2.9) & (
+            np.abs(np.degrees(np.arcsin(toward[:, 2] / np.linalg.norm(toward, axis=1)))) < 4.9
+        )
+        assert part.moved[moved].all() == (number == 3)
+        assert part.moved.sum() == (number == 3) * (~stationary[number]).sum()
+        np.testing.assert_array_equal(part.cluster >= 0, part.moved)
+        assert (np.abs(part.time_s - number * PERIOD_S) <= PERIOD_S).all()
+    times_s = np.array([0.0, 1.0])
+    label = ObjectTrack(
+        1, "Car", np.array([4.0, 2, 2]), times_s, np.array([[0, 8.0, -1]] * 2), np.zeros(2)
+    )
+    still = {number: np.ones(len(mask), bool) for number, mask in stationary.items()}
+    labeled = collect_moving_rays(sweeps, still, [1], [label])
+    toward = labeled.ends - labeled.origins
+    assert np.abs(np.degrees(np.arctan2(toward[:, 1], toward[:, 0])) - 90).max() < 30
+    assert len(labeled.sweep) > 500 and not labeled.moved.any()
+    assert not len(collect_moving_rays(sweeps, still, [1], []).sweep)
+    gone = replace(label, times_s=times_s + 50)
+    assert not len(collect_moving_rays(sweeps, still, [1], [gone]).sweep)
+
+
+def test_snow_is_in_the_air_and_a_thin_pole_is_not():
+    """Flakes are elsewhere in each sweep. A pole also returns single pulses, always the same."""
+    vectors, ring, share = directions(clockwise=False)
+    hall_m = 12 / np.hypot(vectors[:, 0], vectors[:, 1])
+    is_pole = np.abs(share - 0.3) < 0.4 / COLUMNS
+    flakes = []
+    for number in range(8):
+        rng = np.random.default_rng(number)
+        chosen = rng.choice(np.flatnonzero(~is_pole), 400, replace=False)
+        range_m = hall_m.copy()
+        range_m[is_pole] = 3.0
+        range_m[chosen] = rng.uniform(0.6, 4.0, 400)
+        mask = np.zeros(len(ring), bool)
+        mask[chosen] = True
+        flakes.append((range_m, mask))
+    sweeps = RecordedSweeps.from_recording(
+        Recording(
+            "snow", 8, lambda k: Sweep(flakes[k][0][:, None] * vectors, {"ring": RINGS - 1 - ring})
+        )
+    ).with_isolated_ranges()
+    assert (sweeps.isolated.start_m, sweeps.isolated.stop_m) == (0.5, 4.0)
+    placed = aligned(sweeps, PERIOD_S * np.arange(8), Motion.COMPENSATED)
+    still = np.tile(np.eye(4), (8, 1, 1))
+    placed = replace(placed, alignment=replace(placed.alignment, poses=still))
+    masks = find_air_returns(placed, range(8))
+    assert [*masks] == [*range(8)]
+    for number, mask in masks.items():
+        truth = flakes[number][1]
+        assert mask[truth].mean() > 0.95
+        assert not mask[is_pole].any()
+        assert mask[~truth].sum() == 0
+    found = AirStatistics.from_sweeps(placed, masks, np.array([2, 5]))
+    assert found.returns == masks[2].sum() + masks[5].sum()
+    assert 0.6 <= found.ranges_m.min() < 0.8 and 3.8 < found.ranges_m.max() <= 4.0
+    assert len(sweeps.read_surfaces(3)) < len(ring) - 380
+    clear = recorded()
+    assert (
+        find_air_returns(aligned(clear, PERIOD_S * np.arange(5), Motion.COMPENSATED), range(5))
+        == {}
+    )
