@@ -20,7 +20,16 @@ from click.testing import CliRunner
 from tests import simulators
 from tests.simulators import clock, joint_states, transforms
 
-from lidarpool import LidarError, Pose, Scanner, Scene, Sensor, load_sensor
+from lidarpool import (
+    LidarError,
+    Material,
+    Mounted,
+    Pose,
+    Scanner,
+    Scene,
+    Sensor,
+    load_sensor,
+)
 from lidarpool.cli.follow_command import follow
 from lidarpool.clouds.ros.messages import RosMessage, message_store
 from lidarpool.following.node import FollowOptions
@@ -28,6 +37,7 @@ from lidarpool.following.notices import Notices
 from lidarpool.following.opening import FollowSources, create_node
 from lidarpool.following.pose_input import is_wanted
 from lidarpool.scenario.sensors_file import SensorsFile
+from lidarsim.motion.rotations import matrices
 
 DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet
 ROOM = """
@@ -368,6 +378,192 @@ def test_joint_states_move_the_links_of_a_robot(folder):
     assert "A value of the joint turn is ignored, because it is nan." in loop.notes
     assert any("belong to no robot in a .urdf file" in note and "wheel" in note
                for note in loop.notes)  # fmt: skip
+
+
+MIMICS = """
+<robot name="gripper">
+  <link name="base"/><link name="eye"/>
+  <link name="left"><visual><origin xyz="0.2 0 0"/><geometry><box size="0.1 1 1"/></geometry>
+  </visual></link>
+  <link name="right"><visual><origin xyz="0 0.3 0"/><geometry><box size="1 0.1 1"/></geometry>
+  </visual></link>
+  <link name="back"><visual><origin xyz="-2 0 0"/><geometry><box size="0.1 1 1"/></geometry>
+  </visual></link>
+  <joint name="slide" type="prismatic"><parent link="base"/><child link="left"/>
+    <origin xyz="1 0 1"/><axis xyz="1 0 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>
+  </joint>
+  <joint name="copy" type="prismatic"><parent link="base"/><child link="right"/>
+    <origin xyz="0 1 1"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>
+    <mimic joint="slide" multiplier="-2" offset="3"/></joint>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="back"/>
+    <origin xyz="0 0 1"/><axis xyz="0 0 1"/><mimic joint="copy" multiplier="0.1" offset="-0.2"/>
+  </joint>
+  <joint name="pole" type="fixed"><parent link="base"/><child link="eye"/><origin xyz="0 0 1"/>
+  </joint>
+</robot>
+"""
+
+
+@pytest.mark.parametrize("slide", [0.5, -0.5])
+def test_joints_that_mimic_others_follow_their_values(folder, slide):
+    """A joint may mimic a joint that mimics a third. Its own value takes precedence."""
+    (folder / "gripper.urdf").write_text(MIMICS)
+    (folder / "sensors.yaml").write_text(SENSORS.replace("robot/lidar", "eye"))
+    with Loop("gripper.urdf") as loop:
+        for number in range(16):
+            time_s = 3 + number / 50
+            loop.send(joint_states(time_s, {"slide": slide}), clock(time_s))
+            loop.do_what_is_due()
+        points = loop.clouds()[-1].points
+        loop.send(joint_states(3.4, {"slide": slide, "copy": 4.0}), clock(3.4))
+        for number in range(16):
+            time_s = 3.4 + number / 50
+            loop.send(joint_states(time_s, {"slide": slide, "copy": 4.0}), clock(time_s))
+            loop.do_what_is_due()
+        later = loop.clouds()[-1].points
+    assert loop.notes == []
+    for cloud, copied in ((points, 3 - 2 * slide), (later, 4.0)):
+        turned = 0.1 * copied - 0.2
+        depth = cloud @ [-np.cos(turned), -np.sin(turned), 0]
+        left = (np.abs(cloud[:, 1]) < 0.4) & (cloud[:, 0] > 0.5)
+        right = (np.abs(cloud[:, 0]) < 0.1) & (cloud[:, 1] > 0)
+        assert min(left.sum(), right.sum(), (depth > 1.9).sum()) > 50
+        assert np.allclose(cloud[left, 0], 1.15 + slide, atol=0.002)
+        assert np.allclose(cloud[right, 1], 1.25 + copied, atol=0.002)
+        assert np.allclose(depth[depth > 1.9], 1.95, atol=0.003)
+
+
+@pytest.mark.parametrize("late_s", [0.06, 0.0, -0.06])
+def test_sweeps_wait_for_poses_that_arrive_later_than_the_clock(folder, late_s):
+    """Poses may also arrive earlier than the clock, which does not move points either."""
+
+    def frames(time_s):
+        return [*STILL[:1], ("crate", "room", (3 + 2 * (time_s - 10), 0, 0.5), 0.0)]
+
+    with Loop("room.sdf") as loop:
+        for number in range(31):
+            time_s = 10 + number / 50
+            for sent_s in (10.0, time_s - late_s) if number == 0 else (time_s - late_s,):
+                if sent_s >= 10:
+                    loop.send(transforms(sent_s, frames(sent_s)))
+            loop.send(clock(time_s))
+            loop.do_what_is_due()
+        assert loop.notes == []
+    clouds = loop.clouds()
+    assert len(clouds) == (5 if late_s > 0 else 6)
+    for cloud in clouds:
+        x, y, z = cloud.points.T.astype(float)
+        since_s = cloud.stamp_s - 10 + cloud.column("time")
+        front = (np.abs(y) < 0.95) & (x > 1) & (np.abs(z) < 0.45) & (x < 3 + 2 * since_s)
+        assert front.sum() > 200
+        assert np.abs(x[front] - (2.5 + 2 * since_s[front])).max() < 0.002
+        wait_s = cloud.clock_s - cloud.stamp_s - 0.1
+        assert max(late_s, 0) - 0.001 < wait_s < max(late_s, 0) + 0.021
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "is_used"), [(0.9, True), (1.1, False), (-9.9, True), (-10.1, False)]
+)
+def test_poses_are_used_if_their_times_are_close_to_the_clock(folder, offset_s, is_used):
+    loop = Loop("room.sdf")
+    loop.send(clock(50))
+    loop.do_what_is_due()
+    for _ in range(2):  # the clocks of two programs may differ at first
+        loop.send(transforms(50 + offset_s, [("crate", "room", (2, 0, 0.5), 0.0)]), clock(50))
+        loop.do_what_is_due()
+    assert ("crate" in loop.node._tree.received) == is_used
+    loop.send(clock(50.02))
+    loop.do_what_is_due()
+    loop.send(clock(50.04))
+    loop.do_what_is_due()
+    differs = notes_of(loop, f"differs from /clock by {offset_s:g} s. Set use_sim_time")
+    assert len(differs) == (not is_used)
+
+
+@pytest.mark.parametrize(("step_s", "jumps"), [(0.93, False), (1.03, True), (-0.07, True)])
+def test_steps_of_the_clock_that_are_jumps(folder, step_s, jumps):
+    loop = Loop("room.sdf")
+    loop.play(lambda _: STILL, 20, 20.3)
+    loop.play(lambda _: STILL, 20.3 + step_s, 20.5 + step_s)
+    stamps = [round(cloud.stamp_s - 20.3 - step_s, 3) for cloud in loop.clouds()]
+    assert (0.0 in stamps) == jumps
+    assert bool(notes_of(loop, "The simulation time jumped")) == jumps
+
+
+def test_sweeps_that_are_too_late_are_skipped_and_counted(folder):
+    """Of a sensor with 20 sweeps per second and of one with 10, beside a fast simulator."""
+    (folder / "sensors.yaml").write_text(
+        "sensors:\n  slow: {model: velodyne/vlp16, mount: {link: robot/lidar}}\n"
+        "  fast: {model: velodyne/vlp16, rate_hz: 20, mount: {link: robot/lidar}}\n"
+    )
+    loop = Loop("room.sdf")
+    for time_s in (5.0, 5.42, 5.84):
+        loop.send(transforms(time_s, STILL), clock(time_s))
+        loop.do_what_is_due()
+    stamps = {
+        name: [round(cloud.stamp_s, 2) for cloud in loop.clouds(f"/{name}/points")]
+        for name in ("slow", "fast")
+    }
+    assert stamps == {"slow": [5.2, 5.3, 5.6, 5.7], "fast": [5.3, 5.35, 5.7, 5.75]}
+    for name in ("slow", "fast"):
+        assert len(notes_of(loop, f"A sweep of {name} was skipped, because it could not")) == 1
+    assert re.fullmatch(
+        r"8 sweeps were published and 16 skipped\. The delay after the end of a sweep was "
+        r"\d+ ms \(median\) and \d+ ms \(99th percentile\)\.",
+        loop.node.summary,
+    )
+    delays = [int(text) for text in re.findall(r"(\d+) ms", loop.node.summary)]
+    assert delays[0] <= delays[1] < 60_000
+
+
+@pytest.mark.parametrize(("vanish_after_s", "gone_s"), [(0.5, 0.5), (0, None), (2, None)])
+def test_the_time_after_which_a_body_vanishes_can_be_set(folder, vanish_after_s, gone_s):
+    def frames(time_s):
+        return STILL if time_s <= 21 else STILL[:1]
+
+    loop = Loop("room.sdf", vanish_after_s=vanish_after_s)
+    loop.play(frames, 20, 22.5)
+    seen = {}
+    for cloud in loop.clouds():
+        x, y, z = cloud.points.T
+        seen[cloud.stamp_s] = bool(((np.abs(y) < 0.9) & (x > 2) & (np.abs(z) < 0.4)).sum())
+    if gone_s is None:
+        assert all(seen.values()) and not notes_of(loop, "vanished")
+    else:
+        last = max(stamp for stamp, is_seen in seen.items() if is_seen)
+        assert last == pytest.approx(21 + gone_s, abs=0.16)
+        assert notes_of(loop, "crate/link vanished, because no poses were received for 0.5 s.")
+
+
+def test_a_sensor_is_at_its_mount_on_the_frame_and_has_its_own_materials(folder):
+    """The mount is tilted and off center, and the frame turns and climbs."""
+    (folder / "sensors.yaml").write_text(
+        "sensors:\n  roof:\n    model: velodyne/vlp16\n"
+        "    mount: {link: robot/lidar, position: [0.5, -0.2, 1.2], yaw_deg: 40, pitch_deg: 15}\n"
+        "materials: [{objects: crate*, reflectance: 0.9}, {objects: '*', reflectance: 0.1}]\n"
+    )
+    frames = [("robot", "room", (1, 2, 3), 70.0), ("crate", "room", (3, 0, 0.5), 0.0)]
+    loop = Loop("room.sdf")
+    loop.play(lambda _: frames, 20, 20.3)
+    (frame,) = loop.frames
+    mount = Pose((0.5, -0.2, 1.2), yaw_deg=40, pitch_deg=15)
+    place, turn = frame.transform.translation, frame.transform.rotation
+    assert np.allclose([place.x, place.y, place.z], mount.position)
+    (matrix,) = matrices(np.array([[turn.x, turn.y, turn.z, turn.w]]))
+    assert np.allclose(matrix, mount.rotation_matrix)
+    carrier = Pose((1, 2, 3.3), yaw_deg=70)  # the lidar is 0.3 m above the robot
+    scanner = Scanner(
+        Scene.load("room.sdf"),
+        Mounted(load_sensor("velodyne/vlp16"), name="roof", unseen=("robot/base",)),
+        coordinates="sensor",
+        columns=["intensity", "time"],
+        materials=[Material("crate*", reflectance=0.9), Material("*", reflectance=0.1)],
+    )
+    expected = scanner.sweep(carrier.compose(mount), number=1)
+    cloud = loop.clouds()[1]
+    assert len(expected) > 5_000 and abs(len(cloud.points) - len(expected)) < 5
+    assert np.quantile(np.linalg.norm(cloud.points - expected.positions, axis=1), 0.99) < 1e-3
+    assert np.quantile(np.abs(cloud.column("intensity") - expected["intensity"]), 0.99) < 1e-3
 
 
 def test_the_actors_of_a_scenario_follow_their_frames(folder):

@@ -176,10 +176,13 @@ class PoseInput:
         values = dict(zip(state.name, state.position, strict=False))
         known = set()
         for robot, prefix in ((item.robot, item.prefix) for item in self._robots):
+            joints = {joint.name: joint for joint in robot.joints.values()}
             for link, joint in robot.joints.items():
                 source, factor, offset = joint.name, 1.0, 0.0
-                if source not in values and joint.mimic is not None:
-                    source, factor, offset = joint.mimic
+                while source not in values and (mimic := joints[source].mimic) is not None:
+                    source = mimic[0]
+                    offset += factor * mimic[2]
+                    factor *= mimic[1]
                 if source not in values or not joint.is_movable:
                     continue
                 known.add(source)
