@@ -49,11 +49,13 @@ from lidarpool import (
     box,
     compare,
     fit,
+    fit_pattern,
     load_sensor,
     merge,
     open_recording,
     play,
     remove_run,
+    save_cloud,
     show,
     simulate,
     sweeps,
@@ -61,6 +63,7 @@ from lidarpool import (
     twin,
 )
 from lidarpool.run.options import RunKeywords, RunOptions
+from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.sections import PoolSection
 
 POINTS = np.eye(3)
@@ -242,7 +245,9 @@ def test_keywords_are_the_options_of_runs():
             "Did you mean 'startup_",
         ),
         (partial(CAMPAIGN.run, "nowhere"), "folder", "run() got"),
+        (partial(simulate, Scene.seed(), Survey(poses=AT)), "parts", "simulate() got"),
         (CAMPAIGN.stream, "resume", "stream() got"),
+        (CAMPAIGN.stream, "scratch_dir", "stream() got"),
         (CAMPAIGN.stream, "scheduler", "stream() got"),
     ],
 )
@@ -251,6 +256,63 @@ def test_options_that_a_call_does_not_take_are_refused(call, keyword, says):
         call(**{keyword: True})
     assert f"unexpected keyword argument {keyword!r}" in str(raised.value)
     assert all(words in str(raised.value) for words in says.split(" … "))
+
+
+@pytest.mark.parametrize(
+    ("call", "keywords", "says"),
+    [
+        ("simulate", {"resume": True}, "`resume` requires `folder`"),
+        ("simulate", {"scratch_dir": "points"}, "`scratch_dir` requires `folder`"),
+        ("simulate", {"client": object(), "gpu_workers": 2}, "`gpu_workers` applies to a local"),
+        ("simulate", {"client": object(), "other_workers": 2}, "`other_workers` applies"),
+        ("twin", {"resume": True}, "`resume` requires `folder`"),
+        ("run", {"client": object(), "tls": True}, "`tls` applies to a local cluster"),
+        ("stream", {"client": object(), "gpu_workers": 2}, "`gpu_workers` applies"),
+    ],
+)
+def test_options_without_an_effect_are_refused(tmp_path, call, keywords, says):
+    calls = {
+        "simulate": partial(simulate, Scene.seed(), Survey(poses=AT)),
+        "run": partial(CAMPAIGN.run, tmp_path / "set"),
+        "stream": CAMPAIGN.stream,
+        "twin": partial(twin, tmp_path),
+    }
+    with pytest.raises(LidarError) as raised:
+        calls[call](**keywords)
+    assert says in str(raised.value)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("file", ["cloud.ply", "cloud.laz", None])
+def test_a_sensor_of_a_cloud_without_sensors_is_refused(tmp_path, file):
+    cloud = Cloud(np.random.default_rng(1).uniform(0, 9, (60, 3)), {})
+    if file is not None:
+        save_cloud(cloud, tmp_path / file)
+    source = cloud if file is None else tmp_path / file
+    assert open_recording(source, None).count == 1
+    with pytest.raises(LidarError, match=r"Remove the sensor 'roof'\."):
+        open_recording(source, "roof")
+
+
+@pytest.mark.parametrize("call", [fit, fit_pattern, twin])
+def test_the_sensor_of_an_open_recording_is_not_chosen_again(call):
+    recording = open_recording(Cloud(POINTS, {}), name="points")
+    with pytest.raises(LidarError, match=r"points is already open\. Pass `sensor` to `open_rec"):
+        call(recording, sensor="roof")
+
+
+@pytest.mark.parametrize("name", ["las", "parquet", "ply"])
+def test_a_layout_of_a_format_without_layouts_is_refused(tmp_path, name):
+    with pytest.raises(LidarError, match=rf"{name} does not support `layout`.* for mcap and ros"):
+        save_cloud(Cloud(POINTS, {}), tmp_path / "cloud", format=name, layout="autoware")
+    with pytest.raises(LidarError, match="does not support `layout`"):
+        Scenario.from_data({"output": {"write": [{"format": name, "layout": "ouster"}]}})
+
+
+def test_cells_of_range_images_require_sweeps():
+    cloud = Cloud(POINTS, {})
+    with pytest.raises(LidarError, match="cloud A has no sweeps, which `--azimuth-deg` requires"):
+        compare(cloud, cloud, azimuth_deg=1)
 
 
 @pytest.mark.parametrize(

@@ -302,7 +302,7 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 def test_places_that_cannot_be(tmp_path):
     with pytest.raises(LidarError, match="Create its parent folder first"):
         opened(tmp_path / "none" / "run")
-    with pytest.raises(LidarError, match="`parts` requires `folder`"):
+    with pytest.raises(LidarError, match="`scratch_dir` requires `folder`"):
         opened(None, tmp_path / "parts")
 
 

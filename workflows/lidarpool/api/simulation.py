@@ -39,7 +39,7 @@ _UNUSED_BY_CAMPAIGNS = ("folder", "other_workers", "pace")
 _UNUSED_BY_STREAMS = (
     *_UNUSED_BY_SURVEYS,
     *_UNUSED_BY_CAMPAIGNS,
-    "parts",
+    "scratch_dir",
     "resume",
     "live",
     "collectors",
@@ -111,16 +111,16 @@ def simulate(
         result has been saved. By default, the points are stored in a temporary folder that exists
         as long as the result. The folder can also be a URL that fsspec can open, such as
         ``s3://bucket/run``.
-    parts
-        Location of the parts: a folder that the workers can access, or a URL that fsspec can open,
-        such as ``s3://bucket/survey``. This option requires `folder`, which contains the database
-        that lists the parts. `remove_run` removes both. By default, the parts are stored in
-        `folder`.
+    scratch_dir
+        Location of the points during the run: a folder that the workers can access, or a URL that
+        fsspec can open, such as ``s3://bucket/survey``. This option requires `folder`, which
+        contains the database that lists the stored parts. `remove_run` removes both. By default,
+        the points are stored in `folder`.
     resume
-        Whether to continue an unfinished run in `folder`. If there is none, a new run is started.
-        `on_frame` is called with the frames that it has not received yet. Frames that it received
-        in the last second before the earlier run died are repeated, or those of the last few
-        seconds if `folder` is a URL.
+        Whether to continue an unfinished run in `folder`, which is required. If there is none, a
+        new run is started. `on_frame` is called with the frames that it has not received yet.
+        Frames that it received in the last second before the earlier run died are repeated, or
+        those of the last few seconds if `folder` is a URL.
 
     Returns
     -------
@@ -144,6 +144,9 @@ def simulate(
     1613 points
     """
     chosen = check_keywords("simulate", options, without=_UNUSED_BY_SURVEYS)
+    for name in ("resume", "scratch_dir"):
+        if chosen.get(name) and "folder" not in chosen:
+            raise LidarError(f"`{name}` requires `folder`, the folder of the run.")
     run_options = RunOptions(**chosen)
     jobs = SingleJob(Job(scene, survey, planning))
     if run_options.starts_workers:  # fail before the folder is changed
@@ -189,7 +192,7 @@ class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
             Number of casting workers in a local cluster. By default, the number is taken from the
             scenario.
         scratch_dir
-            Location of the points during the run, as for `parts` of `simulate`.
+            Location of the points during the run, as for `simulate`, but without `folder`.
         resume
             Whether to continue an unfinished run in `out`. If there is none, a new run is started.
         restart

@@ -446,6 +446,7 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
         "represent lost returns. To compare lost returns, run the survey with `keep_every: 1`"
     )
     fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
+    source.selected.add(source.sensor or "")
     return open_cloud(
         source.name,
         cloud,

@@ -470,6 +470,8 @@ class RecordingSource:
     # Whether positions are returned in the units and the coordinate system of the file, without
     # checks, and each scan in the file is an item.
     as_stored: bool = False
+    # Sensors and topics that the format has selected; empty if it does not distinguish any.
+    selected: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def recording(self, count: int, read: Callable[[int], Sweep], **fields: Any) -> Recording:
         """Create a recording with `count` sweeps or parts. `fields` are passed to `Recording`."""
@@ -478,7 +480,9 @@ class RecordingSource:
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
         """Return the sensor or topic that the user chose (see the function `choose`)."""
-        return choose(self.name, kind, names, self.sensor)
+        chosen = choose(self.name, kind, names, self.sensor)
+        self.selected.add(chosen)
+        return chosen
 
     def select_sensor(self, sensors: Mapping[str, Recording]) -> Recording:
         """Return the recording of the chosen sensor.
@@ -628,6 +632,10 @@ def open_cloud(
     LidarError
         If there are several sensors and none was chosen, or if the chosen sensor does not exist.
     """
+    if sensor and load_sweeps is None:
+        raise LidarError(
+            f"{name} has no sweeps that state their sensor. Remove the sensor {sensor!r}."
+        )
     fields |= {"intensity_column": intensity, "noise_classes": None}
     if load_sweeps is None:
 

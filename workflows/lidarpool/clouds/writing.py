@@ -43,7 +43,8 @@ _ALWAYS = ("channel", "object")
 _STRENGTHS = {"intensity", "reflectivity", "signal"}
 # Options that only some formats support.
 _OPTIONS = (
-    "compensated", "compensated_actors", "pose_rate_hz", "intensity_full_scale", "organized",
+    "layout", "compensated", "compensated_actors", "pose_rate_hz", "intensity_full_scale",
+    "organized",
 )  # fmt: skip
 _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
@@ -115,7 +116,7 @@ class ExportSpec(FileSection):
     def __post_init__(self) -> None:
         check_fields(self)
         for option in _OPTIONS:  # LidarError for an unknown format
-            is_set = getattr(self, option) not in (False, None)
+            is_set = getattr(self, option) != type(self).__dataclass_fields__[option].default
             if is_set and not self.cloud_format.supports(option):
                 choices = [name for name in FORMATS if load_format(name).supports(option)]
                 such = " formats that store single sweeps:" * (option == "compensated_actors")

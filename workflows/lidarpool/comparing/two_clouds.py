@@ -151,6 +151,8 @@ def compare(
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
         raise LidarError(f"{cloud.name} has no sweeps. Omit `--sweep` and `--match`.")
+    if azimuth_deg is not None:
+        raise LidarError(f"{cloud.name} has no sweeps, which `--azimuth-deg` requires.")
     if protocol is not None:
         raise LidarError(f"{cloud.name} has no sweeps, which `--protocol {protocol}` requires.")
     comparing.notes.append(

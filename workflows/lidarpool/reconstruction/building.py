@@ -30,7 +30,7 @@ from ..clouds.kitti import CALIBRATION_FILE
 from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.lidar4d import WINDOWS
-from ..recordings.opening import open_recording
+from ..recordings.opening import as_recording
 from ..work.lost_workers import LostWorkersError
 from ..work.mapping import MapFunction, parallel_map
 from .air_returns import AirStatistics
@@ -172,6 +172,7 @@ def twin(
     check_number("voxel_m", voxel_m, gt=0, le=10)
     if lidar4d_window is not None:
         check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
+    _check_folder(folder, resume=resume)
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.open(Path(recording), sensor, intensity, lidar4d_window)
@@ -183,9 +184,7 @@ def twin(
                 "A recording in memory can only be reconstructed in this process. Pass the "
                 "path of a recording to use a cluster, or omit the client."
             )
-        if not isinstance(recording, Recording):
-            recording = open_recording(recording, sensor, intensity, name="the recording")
-        recorded = RecordedSweeps.from_recording(recording)
+        recorded = RecordedSweeps.from_recording(as_recording(recording, sensor, intensity))
     _check_sweeps(recorded)
     source = _actor_source(recorded, actors)
     if base is None and not len(recorded.elevation_rad):
@@ -210,6 +209,12 @@ def twin(
             raise
         steps.remove()
     return built
+
+
+def _check_folder(folder: str | Path | None, *, resume: bool) -> None:
+    """Raise LidarError if a reconstruction is to be continued without a folder."""
+    if resume and folder is None:
+        raise LidarError("`resume` requires `folder`, which contains the finished steps.")
 
 
 def _check_sweeps(recorded: RecordedSweeps) -> None:

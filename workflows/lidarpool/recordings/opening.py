@@ -135,9 +135,34 @@ def open_recording(
             f"{name} is always in meters. Remove the unit {unit!r}, which can only be set for "
             f"{join_names(_UNIT_SUFFIXES)} files."
         )
-    recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
-    recording = replace(recording, world_origin=_world_origin(path))
+    opened = RecordingSource(path, name, sensor, intensity, unit)
+    recording = replace(_open_path(opened), world_origin=_world_origin(path))
+    if sensor and not opened.selected:
+        raise LidarError(f"{name} does not name its sensor. Remove the sensor {sensor!r}.")
     return replace(recording, noise_classes=None) if keep_noise else recording
+
+
+def as_recording(
+    recording: str | Path | Cloud | StoredCloud | Recording,
+    sensor: str | None = None,
+    intensity: str | None = None,
+) -> Recording:
+    """Return a recording, or open a source like `open_recording`.
+
+    Raises
+    ------
+    LidarError
+        In the same cases as `open_recording`, or if the recording is open, so that its sensor and
+        its intensity column can no longer be chosen.
+    """
+    if not isinstance(recording, Recording):
+        return open_recording(recording, sensor, intensity, name="the recording")
+    for name, value in (("sensor", sensor), ("intensity", intensity)):
+        if value is not None:
+            raise LidarError(
+                f"{recording.name} is already open. Pass `{name}` to `open_recording` instead."
+            )
+    return recording
 
 
 def _world_origin(path: Path) -> Floats | None:
@@ -180,4 +205,5 @@ def _point_files(folder: Path) -> list[Path]:
 
 def _open_data_set(source: RecordingSource) -> Recording:
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
+    source.selected.add(source.sensor or "")
     return source.recording(len(saved), saved.__getitem__, compensated=True, noise_classes=None)

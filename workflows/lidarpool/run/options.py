@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 else:
     Client = Any  # `RunOptions` checks the class, because importing distributed takes long
 
+# Options of a cluster that is started on this machine.
+_LOCAL_OPTIONS = {"gpu_workers", "other_workers", "tls"}
 # Live view of a run: a page in the browser (True or "page"), a viewer, or False for none.
 Live = bool | Literal["page", "foxglove", "rerun"]
 
@@ -152,10 +154,20 @@ def check_keywords(
     ------
     TypeError
         If the function does not accept a keyword.
+    LidarError
+        If keywords apply to a cluster that is started, but `client` is connected to a cluster.
     """
+    assert RunKeywords.__annotations__.keys() >= {*without}, "these keywords do not exist"
     accepted = RunKeywords.__annotations__.keys() - set(without)
     for name in keywords:
         if name not in accepted:
             suggestion = did_you_mean(name, accepted)
             raise TypeError(f"{call}() got an unexpected keyword argument {name!r}.{suggestion}")
-    return {name: value for name, value in keywords.items() if value is not None}
+    chosen = {name: value for name, value in keywords.items() if value is not None}
+    if "client" in chosen:
+        for name in _LOCAL_OPTIONS & {name for name, value in chosen.items() if value}:
+            raise LidarError(
+                f"`{name}` applies to a local cluster, but `client` is connected to a cluster that "
+                f"is already running. Remove `{name}` or `client`."
+            )
+    return chosen

@@ -23,7 +23,7 @@ from lidarsim.words import plural
 
 from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
-from ..recordings.opening import open_recording
+from ..recordings.opening import as_recording
 from .listed_rays import ListedRays
 from .pattern_returns import PatternReturns
 from .spinning_head import SpinningHead
@@ -144,8 +144,7 @@ def fit_pattern(
     >>> np.round(fitted.model.beams.elevation_deg[:3])
     array([-15., -13., -11.])
     """
-    if not isinstance(recording, Recording):
-        recording = open_recording(recording, sensor, name="the recording")
+    recording = as_recording(recording, sensor)
     returns = PatternReturns.read(recording)
     notes = [*returns.notes, *check_stationary(recording, returns)]
     if recording.compensated and recording.fired is None:

@@ -26,7 +26,7 @@ from lidarview.page_templates import render_template
 
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
-from ...recordings.opening import open_recording
+from ...recordings.opening import as_recording
 from .estimates import Estimate
 from .known_poses import KnownPoses
 from .measured import SensorMeasurement, measure_moving, measure_standing
@@ -127,8 +127,7 @@ def fit(
     if white is not None:
         check_number("white", white, gt=0)
     named = None if model is None else read_model(model)  # before the recording, which takes long
-    if not isinstance(recording, Recording):
-        recording = open_recording(recording, sensor, intensity, name="the recording")
+    recording = as_recording(recording, sensor, intensity)
     check_sweeps(recording)
     loaded = Scene.load(scene) if isinstance(scene, str | Path) else scene
     poses = KnownPoses.from_recording(recording, pose, loaded)

@@ -105,7 +105,8 @@ class RunStore:
         self.opened_at = time.monotonic()
         if parts_location is not None and location is None:
             raise LidarError(
-                "`parts` requires `folder`, because the database in that folder lists the parts."
+                "`scratch_dir` requires `folder`, because the database in that folder lists the "
+                "parts."
             )
         self.jobs = jobs
         self._requested_backend = backend
