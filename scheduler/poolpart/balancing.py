@@ -56,7 +56,9 @@ class BalancedGroup:
     """Partitions that exchange workers according to their work. `Pool.balance` returns it.
 
     The scheduler balances the partitions until `stop` is called, or until fewer than two of them
-    remain, even if this client closes. At the end of a ``with`` block, `stop` is called.
+    remain, even if this client closes. At the end of a ``with`` block, `stop` is called. If the
+    client closes or dies in the block, the scheduler ends the group. `Pool.balanced_groups` lists
+    the groups of all clients.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class BalancedGroup:
         return f"<BalancedGroup: {', '.join(self.names)}>"
 
     def __enter__(self) -> Self:
+        run_on_scheduler(self.client, _bind_group, names=self.names, client_id=self.client.id)
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
@@ -175,6 +178,7 @@ class _Group:
     # {partition that has not been dissolved: number that identifies it}
     partitions: dict[str, int]
     has_gpus: bool  # whether workers of the group have GPUs
+    client: str = ""  # ID of the client whose `with` block the group belongs to
     policy: BalancePolicy = field(default_factory=BalancePolicy)
     moves: deque[WorkerMove] = field(default_factory=lambda: deque(maxlen=MAX_MOVES))
     tasks: set[asyncio.Task[None]] = field(default_factory=set)  # moves in progress
@@ -222,6 +226,11 @@ class GroupBalancer(SchedulerPlugin):
         if not self.groups and self.scheduler.plugins.get(NAME) is self:
             self._stop()
             self.scheduler.remove_plugin(NAME)
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """End the groups of a client that has left within its `with` blocks."""
+        for group in [group for group in self.groups if group.client == client]:
+            self.remove(group)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Recount the slots in use before the next samples are taken."""
@@ -573,6 +582,18 @@ def _loads(group: _Group) -> dict[str, DemandStats]:
             wait_s=demand.wait_s,
         )
     return loads
+
+
+def _bind_group(names: Sequence[str], client_id: str, dask_scheduler: Any = None) -> None:
+    """Let a group, if it exists, end with a client."""
+    balancer: GroupBalancer | None = dask_scheduler.plugins.get(NAME)
+    if balancer is not None and (group := balancer.find(names)) is not None:
+        group.client = client_id
+
+
+def names_of_groups(dask_scheduler: Any = None) -> list[tuple[str, ...]]:
+    """Return the names of the partitions of each group. Runs on the scheduler."""
+    return [group.spec.names for group in _groups(dask_scheduler)]
 
 
 def _stop_group(names: Sequence[str], dask_scheduler: Any = None) -> None:

@@ -259,7 +259,7 @@ class Partition:
             If `slots` is below 1, or if `timeout_s` is not positive.
         PoolError
             If the function is a coroutine function, or if a Dask option is passed that the
-            partition sets itself. Unless the client is asynchronous, its first call waits for a
+            partition sets itself. The client's first call waits for a
             response from the scheduler, and also raises the errors described for `result`. Later
             calls do not wait.
 
@@ -270,8 +270,7 @@ class Partition:
         """
         _check_function(self.name, function)
         _refuse_options("submit", kwargs, **_OF_TASKS)
-        asks = not self.client.asynchronous  # a request would block the client's event loop
-        resources = self._resources_for(slots, asks)
+        resources = self._resources_for(slots)
         if workers is not None:
             several = [workers] if isinstance(workers, str | int) else workers
             if not isinstance(several, Iterable):
@@ -280,7 +279,7 @@ class Partition:
                     f"member of partition {self.name!r}, or a list of names and addresses."
                 )
             # Names are converted to strings, because LocalCluster uses integers.
-            workers = [MemberName(name) if asks else str(name) for name in several]
+            workers = [MemberName(name) for name in several]
         annotations: dict[str, Any] = timeout_annotation(timeout_s)
         if pipes := _names_of_pipes([*args, *kwargs.values()]):
             annotations[USES_PIPES] = pipes
@@ -297,18 +296,21 @@ class Partition:
                 **kwargs,
             )
 
-    def _resources_for(self, slots: int, asks: bool = True) -> dict[str, int]:
+    def _resources_for(self, slots: int) -> dict[str, int]:
         """Validate the number of slots, and return the resources of a task.
 
-        If `asks` is true, the client is registered for the partition, which may send a request to
-        the scheduler.
+        The client is registered for the partition, which may send a request to the scheduler.
+
+        Raises
+        ------
+        PoolError
+            If the client is asynchronous, because the request would block its event loop.
         """
         if not isinstance(slots, int) or slots is True or slots < 1:
             raise ValueError(
                 f"Invalid value {slots!r} for `slots`. Expected an integer of at least 1."
             )
-        if asks:
-            self.by_rule = register(self.client, self.name, slots, self.by_rule)
+        self.by_rule = register(self.client, self.name, slots, self.by_rule)
         return {self.name: slots}
 
     def map(
@@ -677,7 +679,7 @@ class Partition:
         ...     model = xgboost.dask.train(client, {"device": "cuda"}, data)
         """
         require_feature(CLIENTS)
-        self._resources_for(1, asks=not self.client.asynchronous)
+        self._resources_for(1)
         return PartitionClient(self.client, self.name, partial(self._resources_for, 1))
 
     def scatter(self, data: Any, **options: Any) -> Any:

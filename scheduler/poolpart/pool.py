@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from distributed import Client
 
 from .adapting import adaptive_names
-from .balancing import BalancedGroup, balance_partitions
+from .balancing import BalancedGroup, balance_partitions, names_of_groups
 from .division import call_steward, create_partitions, request_dissolution
 from .errors import PoolError
 from .extras.dashboard_page import leave_page, open_page
@@ -489,6 +489,20 @@ class Pool:
             )
         names = [part.name if isinstance(part, Partition) else part for part in partitions]
         return balance_partitions(self.client, names, min, max, workers)
+
+    def balanced_groups(self) -> list[BalancedGroup]:
+        """Return all balanced groups in the cluster, including those of other clients.
+
+        A group that was created outside of a ``with`` block continues after its client has closed.
+        Its method `stop` ends it.
+
+        Examples
+        --------
+        >>> for group in pool.balanced_groups():                           # doctest: +SKIP
+        ...     group.stop()
+        """
+        groups = run_on_scheduler(self.client, names_of_groups)
+        return [BalancedGroup(self.client, names) for names in groups]
 
     def set_weight(self, client: Client | str, weight: float) -> None:
         """Give a client a larger or smaller share of the slots of all partitions.

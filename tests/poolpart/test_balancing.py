@@ -300,6 +300,24 @@ def test_the_group_outlives_its_client_and_ends_with_its_partitions(start, quick
     group.stop()
 
 
+def test_a_group_in_a_block_ends_with_its_client_and_others_are_listed(start, wait_until):
+    client = start({name: {} for name in "abcd"})
+    parts = divide(client, A=2, B=2)
+    pool = Pool.from_client(client)
+    with Client(client.cluster, set_as_default=False) as other:
+        balance(other, parts)  # outside of a block
+    [group] = pool.balanced_groups()
+    assert group.names == ("A", "B") and group.stats().partitions.keys() <= {"A", "B"}
+    other = Client(client.cluster, set_as_default=False)
+    balance(other, parts).__enter__()
+    assert len(pool.balanced_groups()) == 1
+    other.close()  # as if it were killed
+    wait_until(lambda: not pool.balanced_groups())
+    balance(client, parts)
+    pool.balanced_groups()[0].stop()
+    assert BALANCER not in client.cluster.scheduler.plugins
+
+
 def test_a_group_that_was_stopped_moves_no_workers(eight, quickly):
     a, b = parts = divide(eight, A=4, B=4)
     group = balance(eight, parts)

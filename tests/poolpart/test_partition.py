@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, Event, secede
 from tests.poolpart.helpers import twice, wait_for, worker_name
 
-from poolpart import Partition, Pool, PoolError
+from poolpart import Partition, Pipe, Pool, PoolError
 
 
 def stamp():
@@ -112,8 +112,24 @@ def test_an_asynchronous_client_is_refused(_threads):
         async with Client(_threads, asynchronous=True, set_as_default=False) as client:
             with pytest.raises(PoolError, match="does not support asynchronous clients"):
                 Pool.from_client(client)
-            with pytest.raises(PoolError, match="does not support asynchronous clients"):
-                Partition("A", client).stats()
+            part = Partition("A", client)
+            calls = (
+                part.stats,
+                lambda: part.submit(abs, -1),
+                lambda: part.map(abs, [-1]),
+                lambda: part.for_each([-1], abs),
+                lambda: part.compute([]),
+                lambda: part.scatter([1]),
+                part.as_client,
+                part.__enter__,
+                part.page,
+                lambda: part.cancel([]),
+                part.dissolve,
+                lambda: Pipe("asynchronous", 1, client).create(),
+            )
+            for call in calls:
+                with pytest.raises(PoolError, match="does not support asynchronous clients"):
+                    call()
 
     _threads.sync(ask)
 
