@@ -83,7 +83,7 @@ async def create_partitions(
     pool: Mapping[str, WorkerInfo],
     known_partitions: Collection[str],
     own_partitions: Collection[str],
-) -> tuple[dict[str, str], list[WorkerInfo]]:
+) -> tuple[dict[str, str], list[WorkerInfo], str]:
     """Create either all new partitions or none, and apply their rules to workers that join later.
 
     Parameters
@@ -106,6 +106,8 @@ async def create_partitions(
         features that this version of Dask does not support.
     remainder
         Workers of the pool that no rule has selected.
+    scheduler
+        ID of the scheduler.
 
     Raises
     ------
@@ -163,7 +165,8 @@ async def create_partitions(
     members = [records[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
     notes_of_all = {name: " ".join(filter(None, (notes.get(name), common_note))) for name in rules}
-    return notes_of_all, [worker for worker in candidates if records[worker.address] not in members]
+    remainder = [worker for worker in candidates if records[worker.address] not in members]
+    return notes_of_all, remainder, str(steward.scheduler.id)
 
 
 def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:

@@ -25,7 +25,7 @@ class TaskSubmitter(Protocol):
     """The part of a `Partition` that this module uses."""
 
     name: str
-    by_rule: bool  # whether the partition can be dissolved
+    by_rule: str  # see `Partition`
 
     @property
     def client(self) -> Client:

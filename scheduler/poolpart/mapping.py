@@ -221,7 +221,7 @@ class Stage:
     return_exceptions: bool = False
     keywords: dict[str, Any] = field(default_factory=dict)
     result_position: int = 0  # position of the argument that is the result of the previous stage
-    by_rule: bool = False  # whether the partition can be dissolved
+    by_rule: str = ""  # see `Partition`
     empty_s: float = WAIT_S  # maximum time to wait without workers
     annotations: dict[str, Any] = field(default_factory=dict)  # of the tasks
 

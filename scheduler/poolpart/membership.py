@@ -58,7 +58,7 @@ class MemberName(str):
     __slots__ = ()
 
 
-def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
+def register(client: Client, name: str, slots: int, by_rule: str) -> str:
     """Register a client for a partition, unless it is already registered.
 
     Parameters
@@ -68,12 +68,13 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
     slots
         Number of slots that the first task requests.
     by_rule
-        Whether the caller knows that a division of the pool has created the partition.
+        ID of the scheduler on which, as far as the caller knows, a division of the pool has created
+        the partition, or "".
 
     Returns
     -------
-    bool
-        Whether a division of the pool has created the partition, even if it was dissolved.
+    str
+        The same ID, or the ID of this scheduler if the partition was created there.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
         return by_rule
     check_name(name)
     connection = client.scheduler_comm
-    has_or_had_rule, objection, others = run_on_scheduler(
+    divided_on, objection, others = run_on_scheduler(
         client,
         _register,
         name=name,
@@ -106,7 +107,7 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
             existing,
         )
     record_registration(client, name, connection)
-    return bool(has_or_had_rule)
+    return str(divided_on)
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class PartitionCapacity:
     rejection: str  # reason why the tasks could never run, or ""
 
 
-def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> PartitionCapacity:
+def request_capacity(client: Client, name: str, slots: int, by_rule: str) -> PartitionCapacity:
     """Ask the scheduler how many tasks with `slots` slots a partition can run, if any.
 
     The arguments are the same as in `register`.
@@ -259,7 +260,8 @@ class Registrations(SchedulerPlugin):
                     f"Invalid value {slots!r} for the slots of a task in partition {name!r}. "
                     "Expected a number of at least 0."
                 )
-            objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
+            divided_on = str(self.scheduler.id) if name in self.with_rule else ""
+            objection = rejection_reason(self.scheduler, name, slots, divided_on)
             if objection:
                 raise PoolError(objection)
 
@@ -279,17 +281,17 @@ class Registrations(SchedulerPlugin):
 async def _register(
     name: str,
     slots: int,
-    by_rule: bool,
+    by_rule: str,
     client_id: str,
     in_task: bool,
     dask_scheduler: Any = None,
-) -> tuple[bool, str, list[str] | None]:
+) -> tuple[str, str, list[str] | None]:
     """Register a client, unless its task could never run.
 
     Returns
     -------
-    has_or_had_rule
-        Whether a division of the pool has created the partition.
+    divided_on
+        ID of the scheduler on which a division of the pool has created the partition, or "".
     rejection
         Reason why the task could never run, or "".
     others
@@ -298,15 +300,15 @@ async def _register(
     registrations: Registrations | None = dask_scheduler.plugins.get(NAME)
     ruled = has_rule(dask_scheduler, name)
     was_ruled = registrations is not None and name in registrations.with_rule
-    has_or_had_rule = by_rule or ruled or was_ruled
-    objection = rejection_reason(dask_scheduler, name, slots, has_or_had_rule)
+    divided_on = str(dask_scheduler.id) if ruled or was_ruled else by_rule
+    objection = rejection_reason(dask_scheduler, name, slots, divided_on)
     # The last request of a client that was killed may arrive after the client was removed.
     if not objection and client_id in dask_scheduler.clients:
         # The client of a worker stays connected as long as the worker. Therefore, it must not keep
         # the features enabled that other clients have enabled.
         keeps = not (in_task and (ruled or name in names_with_features(dask_scheduler)))
         registrations = registrations or Registrations(dask_scheduler)
-        registrations.register(name, client_id, keeps, has_or_had_rule)
+        registrations.register(name, client_id, keeps, bool(divided_on))
         statistics_of(dask_scheduler, keep=False)
         if not ruled:  # otherwise, the division of the pool has enabled them
             enable_features(dask_scheduler, [name])
@@ -314,7 +316,7 @@ async def _register(
     others = None
     if not expects_any_worker(dask_scheduler, name, slots):
         others = partition_names(dask_scheduler)
-    return has_or_had_rule, objection, others
+    return divided_on, objection, others
 
 
 def partition_names(dask_scheduler: Any = None) -> list[str]:
@@ -344,7 +346,7 @@ def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
 def _capacity(
     name: str,
     slots: int,
-    by_rule: bool,
+    by_rule: str,
     client_id: str,
     task_key: Any,
     dask_scheduler: Any = None,
@@ -402,15 +404,21 @@ def has_rule(scheduler: Any, name: str) -> bool:
     return steward is not None and name in steward.rules
 
 
-def rejection_reason(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
+def rejection_reason(scheduler: Any, name: str, slots: float, divided_on: str) -> str:
     """Return why a task could never run in a partition, or "" if it can.
 
-    If the partition has no members, the task waits, because the only member may be restarting.
+    `divided_on` is the ID of the scheduler on which a division has created the partition, or "". If
+    the partition has no members, the task waits, because the only member may be restarting.
     """
     if has_worker_for(scheduler, name, slots):
         return ""
     members = [worker for worker in workers_declaring(scheduler, name) if worker.resources[name]]
-    if has_or_had_rule and not members and not has_rule(scheduler, name):
+    if divided_on and not members and not has_rule(scheduler, name):
+        if divided_on != scheduler.id:
+            return (
+                f"The scheduler was restarted, and partition {name!r} does not exist on the new "
+                "one. Divide the pool again."
+            )
         return f"Partition {name!r} was dissolved. Divide the pool again, or use another partition."
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     records = steward.members(name) if steward is not None else []

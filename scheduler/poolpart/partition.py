@@ -67,7 +67,8 @@ class Partition:
         Note about the partition, for example that the pool has no GPUs. It is logged as a warning
         when a division creates the partition.
     by_rule
-        Whether the partition was created by a division of the pool, and can therefore be dissolved.
+        ID of the scheduler on which a division of the pool has created the partition, or "". Such a
+        partition can be dissolved, and is lost if the scheduler restarts.
 
     Notes
     -----
@@ -95,7 +96,7 @@ class Partition:
     """
 
     def __init__(
-        self, name: str, client: Client | None = None, note: str = "", by_rule: bool = False
+        self, name: str, client: Client | None = None, note: str = "", by_rule: str = ""
     ) -> None:
         if name != "":  # only for the statistics of tasks without a partition
             check_name(name)

@@ -230,13 +230,13 @@ class Pool:
         ['GPU', 'IO']
         """
         workers = all_workers(self.client)
-        names, with_rule = run_on_scheduler(self.client, _all_and_divided)
+        names, with_rule, scheduler_id = run_on_scheduler(self.client, _all_and_divided)
         return {
             name: Partition(
                 name,
                 self.client,
                 "" if name in with_rule else slots_note(name, workers),
-                by_rule=name in with_rule,
+                by_rule=scheduler_id if name in with_rule else "",
             )
             for name in names
         }
@@ -617,7 +617,7 @@ class Pool:
         for worker in self.workers:  # adds workers that have joined since the last access
             first_seen = self._first_seen.get(worker.name, worker)
             self._first_seen[worker.name] = first_seen.with_gpus(worker.gpus)
-        notes, remaining_workers = call_steward(
+        notes, remaining_workers, scheduler_id = call_steward(
             self.client,
             create_partitions,
             rules=dict(rules),
@@ -625,7 +625,9 @@ class Pool:
             known_partitions=set(self.partitions()),
             own_partitions=set(self._partition_names),
         )
-        parts = {name: Partition(name, self.client, note, True) for name, note in notes.items()}
+        parts = {
+            name: Partition(name, self.client, note, scheduler_id) for name, note in notes.items()
+        }
         for part in parts.values():
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
@@ -637,12 +639,13 @@ class Pool:
         return parts, remainder
 
 
-def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
-    """Return the names of all partitions, and the names of those with a rule.
+def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str], str]:
+    """Return the names of all partitions, of those with a rule, and the ID of the scheduler.
 
     Runs on the scheduler.
     """
-    return partition_names(dask_scheduler), names_with_rule(dask_scheduler)
+    names = partition_names(dask_scheduler)
+    return names, names_with_rule(dask_scheduler), str(dask_scheduler.id)
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:

@@ -45,6 +45,17 @@ def test_a_partition_that_was_dissolved(start):
     assert part.submit(worker_name).result(LONG_S) in ("a", "b")
 
 
+def test_a_partition_of_a_scheduler_that_was_restarted(start):
+    part = Pool.from_client(start({"a": {}})).divide({"A": rest()})["A"]
+    client = start({"b": {}})  # like the new scheduler at the address of the former one
+    lost = Partition("A", client, by_rule=part.by_rule)
+    for call in calls(lost):
+        with pytest.raises(PoolError, match="The scheduler was restarted, and partition 'A' does"):
+            call()
+    Pool.from_client(client).divide({"A": rest()})
+    assert lost.submit(worker_name).result(LONG_S) == "b"
+
+
 def test_by_another_client(start, monkeypatch):
     """A client that submits without a request gets the error from its tasks."""
     client = start({"a": {}})
@@ -241,7 +252,7 @@ def test_who_cannot_submit_is_not_registered(start, monkeypatch):
         Partition("A", client).submit(worker_name, slots=2)
     # The last request of a client that was killed may arrive after it has left.
     monkeypatch.setattr(client, "id", "gone")
-    assert membership.register(client, "A", 1, by_rule=False) is False
+    assert membership.register(client, "A", 1, by_rule="") == ""
     assert membership.NAME not in client.cluster.scheduler.plugins
 
 
@@ -277,11 +288,12 @@ async def submit_in_the_loop(part):
     return await part.submit(worker_name)
 
 
-def test_a_coroutine_submits_without_asking(start):
+def test_a_coroutine_cannot_submit_in_the_event_loop(start):
     client = start({"a": {"nthreads": 2}})
     part, _ = Pool.from_client(client).partition("A", n_workers=1, slots=2)
     future = client.submit(submit_in_the_loop, part, resources={"A": 1})
-    assert future.result(LONG_S) == "a"
+    with pytest.raises(PoolError, match="does not support asynchronous clients"):
+        future.result(LONG_S)
 
 
 def test_fewer_workers_than_a_rule_asks_for_are_noted(start, caplog):

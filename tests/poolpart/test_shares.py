@@ -123,9 +123,9 @@ def test_the_window_of_a_map_follows_its_share(start):
         time.sleep(0.1)
         stage = alice.stats().stages["wait_for-map"]
         assert stage.running + stage.queued == 2  # two tasks for its one slot
-        capacity = request_capacity(client, "P", 1, by_rule=False)
+        capacity = request_capacity(client, "P", 1, by_rule="")
         assert (capacity.max_running, capacity.slots, capacity.free) == (1, 2, 0)
-        assert capacity.idle_s == request_capacity(client, "P", 1, by_rule=False).idle_s
+        assert capacity.idle_s == request_capacity(client, "P", 1, by_rule="").idle_s
         gate.set()
         assert next(beside)
         beside.close()
