@@ -21,10 +21,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import LidarError, Material, Mounted, Noise, Scanner, Track, load_sensor
+from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scanner, Track, load_sensor
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.motion.rotations import quaternions_of
 
 grpc = pytest.importorskip("grpc")
 descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
@@ -256,6 +257,110 @@ def test_the_bytes_are_those_of_a_scanner(folder):
     assert reply.point_intensities == bytes_of
 
 
+# A box of 3 x 1 x 2 m with a corner at the origin
+BOX = """
+v 0 0 0\nv 3 0 0\nv 3 1 0\nv 0 1 0\nv 0 0 2\nv 3 0 2\nv 3 1 2\nv 0 1 2
+f 1 4 3 2\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8
+"""
+FAR = """
+scene: {files: [{file: wall.obj, up_axis: z, unit: m}]}
+sensor: velodyne/vlp16
+world: {origin: [500000, 4000000, 300]}
+trajectory:
+  points:
+    - {time_s: 3.0, position: [-2, 0, 1], yaw_deg: 0}
+    - {time_s: 3.5, position: [3, 1, 1], yaw_deg: 90}
+    - {time_s: 4.2, position: [3, 9, 4], yaw_deg: 180}
+  duration_s: 1
+actors:
+  - name: box
+    file: {file: box.obj, up_axis: z, unit: m}
+    trajectory: {points: [{time_s: 3, position: [5, 0, 0]}, {time_s: 5, position: [8, 0, 0]}]}
+cloud: {precision_m: 0.0001}
+"""
+
+
+def tilted(position: Any, yaw_deg: float, pitch_deg: float, roll_deg: float) -> dict[str, Any]:
+    """A pose with all three angles."""
+    matrix = Pose((0, 0, 0), yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg)
+    ((qx, qy, qz, qw),) = quaternions_of(matrix.rotation_matrix[None])
+    x, y, z = map(float, position)
+    quat = {"x": float(qx), "y": float(qy), "z": float(qz), "w": float(qw)}
+    return {"vec": {"x": x, "y": y, "z": z}, "quat": quat}
+
+
+def test_poses_are_in_world_coordinates_and_boxes_are_turned_about_their_centers(folder):
+    """The world is far from the scene, the sensor is tilted, and the box is off its origin."""
+    (folder / "box.obj").write_text(BOX)
+    (folder / "far.yaml").write_text(FAR)
+    origin = np.array([500_000.0, 4_000_000, 300])  # single precision can store them
+    sensor_pose = tilted(origin + np.array([1, 2, 0]), 20, 10, -30)
+    center = np.array([6.0, 2.5, 0.5])
+    entry = {"track_id": "box", "pose_pair": dict.fromkeys(("start_pose", "end_pose"))}
+    for name in entry["pose_pair"]:
+        entry["pose_pair"][name] = pose(origin + center, 90)
+    fields = request(
+        scene_id="far",
+        sensor_pose={"start_pose": sensor_pose, "end_pose": sensor_pose},
+        dynamic_objects=[entry],
+    )
+    with serving(folder / "far.yaml", {PANDAR128: "velodyne/vlp16"}) as client:
+        points = xyz(client.render_lidar(**fields)).astype(np.float64)
+        reply = client.get_available_trajectories(scene_id="far")
+    rotation = Pose((0, 0, 0), yaw_deg=20, pitch_deg=10, roll_deg=-30).rotation_matrix
+    local = points @ rotation.T + [1, 2, 0]
+    # The box is 3 m long, 1 m wide and 2 m high, and turned by 90 degrees.
+    sides = np.abs(local - center) - [0.5, 1.5, 1.0]
+    on_box = (sides < 0.005).all(axis=1)
+    assert on_box.sum() > 200 and np.abs(sides[on_box].max(axis=1)).max() < 0.003
+    on_wall = np.abs(local[:, 0] - 10) < 0.003
+    assert on_wall.sum() > 200 and (on_box | on_wall).all()
+    (trajectory,) = reply.available_trajectories
+    rows = trajectory.trajectory.poses
+    assert [row.timestamp_us for row in rows] == [0, 500_000]  # those during the survey
+    places = [[row.pose.vec.x, row.pose.vec.y, row.pose.vec.z] for row in rows]
+    assert np.allclose(places, origin + np.array([[-2, 0, 1], [3, 1, 1]]), atol=0.3)
+    assert np.allclose([row.pose.quat.z for row in rows], [0, np.sqrt(0.5)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("length_ms", "fits"), [(89, False), (91, True), (109, True), (111, False)]
+)
+def test_frames_may_be_a_tenth_shorter_or_longer_than_a_sweep(client, length_ms, fits):
+    fields = request(frame_end_us=1_000_000 + 1000 * length_ms)
+    if fits:
+        assert xyz(client.render_lidar(**fields))[0, 0] == pytest.approx(10, abs=2e-4)
+    else:
+        _, message = client.refusal("render_lidar", **fields)
+        assert f"The frame lasts {length_ms} ms, but a sweep of Line lasts 100 ms" in message
+
+
+def test_each_device_has_its_own_sensor_and_sweeps_are_counted(folder):
+    models = {PANDAR128: str(folder / "line.yaml"), AT128: "velodyne/vlp16"}
+    with serving(folder / "yard.yaml", models) as client:
+        few = client.render_lidar(**request())
+        many = client.render_lidar(**request(lidar_config={"lidar_type": AT128}))
+        assert 100 < few.num_points < 360 and many.num_points > 2000
+        assert xyz(many)[:, 2].min() < -1 < xyz(few)[:, 2].min()
+        client.render_aggregated(lidar_requests=[request(), request()])
+        client.refusal("render_lidar", **request(scene_id="x"))
+        points = 3 * few.num_points + many.num_points
+        assert client.service.summary == (
+            f"4 sweeps with {points:,} points simulated. 1 request refused."
+        )
+
+
+def test_all_sweeps_of_an_aggregated_request_share_the_limit(client, monkeypatch):
+    count = client.render_lidar(**request()).num_points
+    monkeypatch.setattr(service_module, "MAX_POINTS", 2 * count)
+    reply = client.render_aggregated(lidar_requests=[request()] * 2)
+    assert [one.num_points for one in reply.lidar_returns] == [count] * 2
+    monkeypatch.setattr(service_module, "MAX_POINTS", 2 * count - 1)
+    code, message = client.refusal("render_aggregated", lidar_requests=[request()] * 2)
+    assert code == "RESOURCE_EXHAUSTED"
+    assert f"has {count:,} points, but the reply can only hold {count - 1:,}" in message
+
+
 def test_equal_requests_have_equal_replies_and_random_numbers_depend_on_the_time(folder):
     with serving(folder / "noisy.yaml", {PANDAR128: str(folder / "line.yaml")}) as client:
         fields = request(scene_id="noisy")
@@ -413,6 +518,11 @@ def test_unknown_objects_can_be_ignored(folder):
             assert points[0, 0] == pytest.approx(2, abs=2e-4)
         assert [note for note in client.notes if "van" in note] == [
             "The scene has no actor 'van 7', so it is ignored."
+        ]
+        objects = [moving(f"bus {k:02}", (3, 0, 0), (3, 0, 0)) for k in range(30)]
+        assert xyz(client.render_lidar(**request(dynamic_objects=objects)))[0, 0] > 9
+        assert client.notes[1:] == [
+            f"The scene has no actor 'bus {k:02}', so it is ignored." for k in range(19)
         ]
 
 
