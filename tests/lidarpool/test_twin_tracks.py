@@ -108,6 +108,7 @@ def turn(sign):
     return path
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_car_in_a_curve_faces_its_direction_of_travel(sign):
     (track,) = find_tracks(rays_of([turn(sign)], 18), None, PERIOD_S)
@@ -127,6 +128,7 @@ def braking(times_s):
     )
 
 
+@pytest.mark.extended
 def test_a_car_that_stops_stays_where_it_stops():
     (track,) = find_tracks(rays_of([braking], 24), None, PERIOD_S)
     check_track(track, braking, np.arange(0.15, 2.2, 0.1), position_m=0.06, yaw_rad=0.02)
@@ -139,6 +141,7 @@ def test_a_car_that_stops_stays_where_it_stops():
     assert reverse.stands_before and not reverse.stands_after
 
 
+@pytest.mark.extended
 def test_cars_that_meet_are_two_objects_of_their_own_shape():
     def near(times_s):
         return (6 * np.asarray(times_s) - 5, 0 * times_s + 6.0, 0 * times_s)
