@@ -257,7 +257,7 @@ def test_snow_is_in_the_air_and_a_thin_pole_is_not():
     hall_m = 12 / np.hypot(vectors[:, 0], vectors[:, 1])
     is_pole = np.abs(share - 0.3) < 0.4 / COLUMNS
     flakes = []
-    for number in range(8):
+    for number in range(11):
         rng = np.random.default_rng(number)
         chosen = rng.choice(np.flatnonzero(~is_pole), 400, replace=False)
         range_m = hall_m.copy()
@@ -268,15 +268,15 @@ def test_snow_is_in_the_air_and_a_thin_pole_is_not():
         flakes.append((range_m, mask))
     sweeps = RecordedSweeps.from_recording(
         Recording(
-            "snow", 8, lambda k: Sweep(flakes[k][0][:, None] * vectors, {"ring": RINGS - 1 - ring})
+            "snow", 11, lambda k: Sweep(flakes[k][0][:, None] * vectors, {"ring": RINGS - 1 - ring})
         )
     ).with_isolated_ranges()
     assert (sweeps.isolated.start_m, sweeps.isolated.stop_m) == (0.5, 4.0)
-    placed = aligned(sweeps, PERIOD_S * np.arange(8), Motion.COMPENSATED)
-    still = np.tile(np.eye(4), (8, 1, 1))
+    placed = aligned(sweeps, PERIOD_S * np.arange(11), Motion.COMPENSATED)
+    still = np.tile(np.eye(4), (11, 1, 1))
     placed = replace(placed, alignment=replace(placed.alignment, poses=still))
-    masks = find_air_returns(placed, range(8))
-    assert [*masks] == [*range(8)]
+    masks = find_air_returns(placed, range(11))
+    assert [*masks] == [*range(11)]
     for number, mask in masks.items():
         truth = flakes[number][1]
         assert mask[truth].mean() > 0.95
