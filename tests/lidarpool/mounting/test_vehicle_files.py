@@ -209,11 +209,15 @@ def test_any_names_make_a_scenario(folder):
             SMALL
             | {"targets": {"*": target, "a[b]": target | {"reflectance": 0.6}}, "combine": "all"}
             | {"sensors": {"left": {"model": "rings.yaml", "mounts": mounts}}}
+            | {"noise": {"detection_range_m": 60}, "weather": {"visibility_km": 0.4}}
         )
     )
     outcome = mount("car.yaml", "--workers", "1")
     assert outcome.exit_code == 0, outcome.output
     best = Scenario.load("car-mounts/best.yaml")
+    assert best.noise.detection_range_m == 60
+    assert best.weather.visibility_km == 0.4
+    assert "returns" not in yaml.safe_load(Path("car-mounts/best.yaml").read_text())
     survey = prepare(best).survey
     found = {material.objects: material.reflectance for material in survey.materials}
     assert found == {("[*]",): 0.3, ("a[[]b]",): 0.6, ("*",): 0.1}
