@@ -16,6 +16,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
+from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.scene_mesh import SceneMesh
 
@@ -289,6 +290,69 @@ def test_cars_move_during_a_sweep(clear, sensor):
     augmenter = Augmenter(clear, Effects(actors=(Actor(CAR, track),)), sensor)
     first, second = (augmenter.sweep(number).boxes.rows[0, 0] for number in (0, 1))
     assert second - first == pytest.approx(0.1 * speed, abs=1e-3)
+
+
+def test_added_points_have_the_times_of_their_firings(clear, sensor):
+    """About half of the pulses have no recorded return, whose time they could copy."""
+    result = Augmenter(clear, Effects(weather=Weather(visibility_km=0.05)), sensor).sweep(0)
+    recorded = clear[0]
+
+    def turned(points, channel):
+        """Return the rotation of the head in turns."""
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) - sensor.beams.azimuth[channel]
+        return -azimuth / (2 * np.pi)
+
+    offset = recorded.columns["time"] / 0.1 - turned(recorded.points, recorded.columns["channel"])
+    start = np.angle(np.exp(2j * np.pi * offset).mean()) / (2 * np.pi)
+    added = ~result.is_recorded
+    channel = result.sweep.columns["channel"][added]
+    expected = turned(result.sweep.points[added], channel) + start
+    late = result.sweep.columns["time"][added] / 0.1 - expected
+    late -= np.rint(late)
+    assert added.sum() > 5000
+    assert np.quantile(np.abs(late), 0.99) < 1 / 512
+    assert abs(np.median(late)) < 0.3 / 512
+
+
+def test_constant_times_are_kept(clear, sensor):
+    def read(number):
+        sweep = clear.read(number)
+        return sweep.replace(columns={**sweep.columns, "time": np.full(len(sweep), 7.0)})
+
+    constant = replace(clear, read=read, read_stamps=None)
+    result = Augmenter(constant, Effects(weather=Weather(visibility_km=0.1)), sensor).sweep(0)
+    assert (~result.is_recorded).any()
+    assert (result.sweep.columns["time"] == 7).all()
+
+
+def test_a_car_keeps_its_place_far_away_while_the_sensor_turns(scene, sensor):
+    columns = ["range", "intensity", "cause", "time"]
+    scanner = Scanner(scene, sensor, columns=columns, coordinates="sensor")
+    places = [Pose((2.0 * k, -0.7 * k, HEIGHT_M), yaw_deg=20.0 + 15 * k) for k in range(3)]
+    clouds = [scanner.sweep(place) for place in places]
+    poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    for pose, place in zip(poses, places, strict=True):
+        pose[:3, :3] = place.rotation_matrix
+        pose[:3, 3] = np.add(place.position, [500_000.25, 5_400_000.5, 40])
+    recording = recording_of(clouds, read_poses=lambda: poses, compensated=None)
+    effects = Effects(insertions=(Insertion(CAR, 9, -3, -HEIGHT_M, heading_deg=35),))
+    augmenter = Augmenter(recording, effects, sensor)
+    first = np.eye(4)
+    heading = np.radians(35)
+    first[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+    first[:3, 3] = [9, -3, -HEIGHT_M]
+    middle = np.array([*CAR.vertices.mean(axis=0), 1.0])
+    for number in range(3):
+        result = augmenter.sweep(number)
+        in_sensor = np.linalg.inv(poses[number]) @ poses[0] @ first
+        boxes = result.boxes
+        np.testing.assert_allclose(boxes.centers[0], (in_sensor @ middle)[:3], atol=1e-3)
+        forward = matrices(boxes.quaternions)[0][:, 0]
+        np.testing.assert_allclose(forward, in_sensor[:3, 0], atol=1e-6)
+        added = result.sweep.points[~result.is_recorded]
+        local = (added - boxes.centers[0]) @ matrices(boxes.quaternions)[0]
+        assert len(added) > 50
+        assert (np.abs(local) <= boxes.sizes[0] / 2 + 0.05).mean() > 0.98
 
 
 def test_later_sweeps_without_intensities_are_named(clear, sensor):
