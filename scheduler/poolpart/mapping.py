@@ -13,6 +13,7 @@ import math
 import queue
 import reprlib
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import nullcontext, suppress
@@ -239,6 +240,17 @@ class Stage:
         """Ask the scheduler how many tasks of this stage the partition can run, if any."""
         return request_capacity(self.client, self.partition, self.slots, self.by_rule)
 
+    def _keys(self, firsts: Sequence[int], calls: Sequence[Sequence[Call]]) -> list[str]:
+        """Return a unique key for each chunk, which names its items."""
+        # Dask derives the prefix from the first word and further words of letters only.
+        prefix = f"{funcname(self.function)}-map-{uuid.uuid4()}"
+        return [
+            f"{prefix}-item-{first}"
+            if len(chunk) == 1
+            else f"{prefix}-items-{first}-to-{first + len(chunk) - 1}"
+            for first, chunk in zip(firsts, calls, strict=True)
+        ]
+
     def send(
         self,
         patience_s: float,
@@ -266,8 +278,7 @@ class Stage:
                 # are large.
                 [self.keywords] * len(firsts),
                 *([previous_tasks] if previous_tasks else []),
-                # Dask derives the prefix from the first word and further words of letters only.
-                key=f"{funcname(self.function)}-map",
+                key=self._keys(firsts, calls),
                 pure=False,
                 priority=self.priority,
                 retries=self.retries or None,

@@ -18,6 +18,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from .adapting import shared_queue_of
 from .features import FEATURES
 from .fence import fence_names
+from .internals.scheduler import in_running_order
 from .partition_stats import PartitionStats, StageStats, describe_size
 from .shares import clients_of
 from .steward import target_of
@@ -177,7 +178,7 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
 
 def _running_tasks(worker: Any, partition: str) -> Iterator[Any]:
     free = slots_of(worker, partition)
-    for task in islice(worker.processing, _MAX_EXAMINED):
+    for task in islice(in_running_order(worker), _MAX_EXAMINED):
         if partition_of(task) == partition and (takes := _slots_taken(task, partition)) <= free:
             free -= takes
             yield task

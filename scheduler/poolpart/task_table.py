@@ -27,7 +27,8 @@ class TaskRow(NamedTuple):
         "running", "done" or "failed". The scheduler is not notified when a task starts, so it
         assumes that a worker runs as many of its tasks as it has slots.
     key
-        Key of the task and of its future.
+        Key of the task and of its future. The key of a task of `Partition.map` ends with the
+        indices of its items, for example ``-item-7`` or ``-items-8-to-11``.
     function
         Prefix of the key, which is the name of the function for most tasks.
     worker

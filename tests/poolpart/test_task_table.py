@@ -57,6 +57,7 @@ def test_tasks_that_wait_run_and_end(part, wait_until):
     rows = part.tasks()
     assert [row.state for row in rows] == ["waiting", "queued", "running", "running"]
     assert {row.key for row in rows[1:]} == {future.key for future in running}
+    assert rows[1].key == running[2].key  # those that were submitted first run
     waiting = rows[0]
     assert (waiting.key, waiting.function, waiting.worker, waiting.slots) == (
         last.key, "after", "", 2
@@ -135,3 +136,10 @@ def test_a_long_table_is_printed_in_part(part):
     )
     page = table._repr_html_()
     assert page.count("<tr>") == 1 + 20 and last in page
+
+
+def test_the_keys_of_a_map_name_its_items(a):
+    assert list(a.map(abs, range(-5, 0), chunk=2)) == [5, 4, 3, 2, 1]
+    keys = {task.key for task in a.tasks() if task.function == "abs-map"}
+    ends = ("-items-0-to-1", "-items-2-to-3", "-item-4")
+    assert {end for end in ends for key in keys if key.endswith(end)} == {*ends}

@@ -130,6 +130,11 @@ def reported_tasks(worker: Any) -> set[Any]:
     return (worker.executing.keys() & worker.processing) | worker.long_running
 
 
+def in_running_order(worker: Any) -> list[Any]:
+    """Return a worker's tasks in the order in which it is assumed to run them."""
+    return sorted(worker.processing, key=lambda t: (t not in worker.executing, t.priority))
+
+
 def running_candidates(worker: Any) -> set[Any]:
     """Return the tasks that a worker runs, or may run, as far as the scheduler knows.
 
