@@ -723,11 +723,28 @@ def test_range_images_are_yellow_where_it_is_near():
     assert near < -0.99 and far > 0.99
 
 
-def test_a_ring_that_only_one_sees_is_noted():
+@pytest.mark.parametrize("dead_in", ["a", "b"])
+@pytest.mark.parametrize(
+    ("dead", "says"), [((3,), "ring 3 (-9.0°)"), ((14, 3), "rings 14 (13.0°) and 3 (-9.0°)")]
+)
+def test_channels_without_returns_in_one_cloud_are_named_and_drawn(dead_in, dead, says):
     there = np.ones((RINGS, COLUMNS), bool)
-    there[3] = False
-    notes = compare(cloud(there=there), cloud()).figures["notes"]
-    assert "1 ring has returns in only one of the clouds" in str(notes)
+    there[list(dead)] = False
+    there[8, :72] = False  # a tenth of a ring that works
+    clouds = {"a": cloud(), "b": cloud(), dead_in: cloud(there=there)}
+    found = compare(clouds["a"], clouds["b"])
+    assert found.figures["notes"] == [f"cloud {dead_in.upper()} has no returns in {says}"]
+    gaps = comparison.draw_rings(found).figure.axes[1]
+    drawn = {
+        line.get_label(): dict(zip(np.round(line.get_ydata()), line.get_xdata(), strict=True))
+        for line in gaps.lines
+    }
+    assert len(drawn["A"]) == len(drawn["B"]) == RINGS
+    for ring, elevation in enumerate(np.round(ELEVATION)):
+        expected = 100 if ring in dead else 10 if ring == 8 else 0
+        assert drawn[dead_in.upper()][elevation] == pytest.approx(expected)
+        assert drawn["B" if dead_in == "a" else "A"][elevation] == 0
+    assert gaps.get_xlim()[1] > 100
 
 
 def test_maps_of_georeferenced_clouds_have_short_numbers():

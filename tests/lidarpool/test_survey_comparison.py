@@ -25,9 +25,11 @@ from lidarpool import (
     compare,
     compare_strips,
     compare_surveys,
+    open_recording,
 )
 from lidarpool.cli.commands import cli
 from lidarpool.comparing.surveys import pairs
+from lidarpool.comparing.surveys.survey_charts import draw_facades
 from lidarsim.sweeps.sweeps import Sweeps
 
 ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])
@@ -717,9 +719,80 @@ def test_the_command_writes_a_table_maps_and_a_page(tmp_path):
         assert (tmp_path / "out" / f"compare-{name}.png").stat().st_size > 10_000
 
 
+def building(seed, *, dent=0.0):
+    """The ground around a building that is rotated by 25 degrees, and its four walls.
+
+    The wall to the southeast, which is 16 m wide, is dented near its right end, seen from outside.
+    """
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform((-20, -20, 0), (20, 20, 0), (6000, 3))
+    is_inside = (np.abs(ground[:, 0]) < 8) & (np.abs(ground[:, 1]) < 5)
+    walls = []
+    for start, along in (
+        ((-8, -5), (16, 0)), ((8, -5), (0, 10)), ((8, 5), (-16, 0)), ((-8, 5), (0, -10)),
+    ):  # fmt: skip
+        shares = rng.uniform(0, 1, (3000, 2))
+        wall = np.column_stack([np.array(start) + shares[:, :1] * along, 6 * shares[:, 1]])
+        wall[np.hypot(wall[:, 0] - 5, wall[:, 2] - 2) < 1.5 * (along[0] > 0), 1] += dent
+        walls.append(wall)
+    points = np.concatenate([ground[~is_inside], *walls])
+    c, s = np.cos(np.radians(25)), np.sin(np.radians(25))
+    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + ORIGIN
+
+
+def test_facades_are_seen_from_the_front_and_the_scale_contains_a_small_change(tmp_path):
+    for name, dent in (("before", 0.0), ("after", 0.15)):
+        (tmp_path / name).mkdir()
+        points = building(int(dent > 0), dent=dent)
+        write_las(tmp_path / name / "cloud.laz", points, epsg=25832)
+    a, b = tmp_path / "after" / "cloud.laz", tmp_path / "before" / "cloud.laz"
+    arguments = ("--survey", "planes", "--out", tmp_path / "out", "--radius", 0.7)
+    done = invoke(a, b, *arguments, "--points", tmp_path / "deviations.laz")
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "out" / "compare.html").read_text()
+    title = re.search("<title>(.*?)</title>", page, re.DOTALL)[1]
+    assert " ".join(title.split()) == "after/cloud.laz and before/cloud.laz"
+    assert (tmp_path / "out" / "compare-facades.png").stat().st_size > 10_000
+
+    written = laspy.read(tmp_path / "deviations.laz")
+    assert open_recording(tmp_path / "deviations.laz").epsg == 25832
+    found = compare_surveys(a, b, method="planes", radius_m=0.7)
+    assert len(written.points) == len(found.points) > 14_000
+    distances = found.components["distance"]
+    assert np.allclose(np.sort(written["distance"]), np.sort(distances), atol=1e-6)
+    front = np.array([np.sin(np.radians(25)), -np.cos(np.radians(25))])
+    local = np.stack([written.x, written.y, written.z], axis=1) - ORIGIN
+    dented = np.abs(local[:, :2] @ front - 4.85) < 0.005
+    assert np.median(written["distance"][dented]) == pytest.approx(-0.15, abs=0.01)
+    normals = np.stack([written["NormalX"], written["NormalY"]], axis=1)[dented]
+    assert np.median(normals @ front) > 0.99
+
+    charts = draw_facades(found.points, found.components, found.columns).figure.axes[:4]
+    names = [text.get_text() for axes in charts for text in axes.texts]
+    sides = dict(zip([name.removeprefix("facing ") for name in names], charts, strict=True))
+    assert sides.keys() == {"southeast", "northeast", "northwest", "southwest"}
+    (image,) = sides["southeast"].images
+    left, right, bottom, top = image.get_extent()
+    values = np.ma.filled(image.get_array(), 0)
+    row, column = np.unravel_index(values.argmin(), values.shape)
+    assert right - left == pytest.approx(16, abs=0.5)
+    assert left + (column + 0.5) / values.shape[1] * (right - left) == pytest.approx(13, abs=1.5)
+    assert bottom + (row + 0.5) / values.shape[0] * (top - bottom) == pytest.approx(102, abs=1.5)
+    assert image.norm.vmax > 100, "mm: the scale contains the dent"
+    for name in ("northeast", "northwest", "southwest"):
+        assert np.abs(sides[name].images[0].get_array()).max() < 60
+
+
+def test_hardly_any_steep_points_are_no_facade():
+    found = compare_surveys(cloud(plane(900)), cloud(plane(900, seed=2)), method="planes")
+    assert draw_facades(found.points, found.components, found.columns) is None
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (["a", "b", "--points", "x.laz"], "`--points` requires `--survey`"),
+        (["a", "b", "--survey", "planes", "--points", "x.pdf"], "its extension must be .laz,"),
         (["a"], "Missing argument 'B'"),
         (["a", "b", "c"], "More than two clouds require `--survey strips`"),
         (["a", "b", "--cell", "2"], "`--cell` requires `--survey`"),

@@ -293,3 +293,21 @@ def list_names(names: Sequence[str], max_names: int = 3) -> str:
     """
     further = len(names) - max_names
     return ", ".join(names[:max_names]) + (f" and {further:,} more" if further > 0 else "")
+
+
+def distinct_names(paths: Sequence[str]) -> list[str]:
+    """Return the last parts of paths, with as many parent folders as required to distinguish them.
+
+    Examples
+    --------
+    >>> distinct_names(["before/cloud.las", "after/cloud.las"])
+    ['before/cloud.las', 'after/cloud.las']
+    >>> distinct_names(["/data/before.las", "results/after/"])
+    ['before.las', 'after']
+    """
+    parts = [path.rstrip("/").split("/") for path in paths]
+    for count in range(1, max(map(len, parts), default=1)):
+        names = ["/".join(part[-count:]) for part in parts]
+        if len({*names}) == len(paths):
+            return names
+    return [path.rstrip("/") for path in paths]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
-from lidarsim.words import plural, remove_common_prefix, shorten_name
+from lidarsim.words import distinct_names, plural, remove_common_prefix, shorten_name
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -79,6 +79,7 @@ def _template(name: str, modules: tuple[str, ...]) -> Template:
         plural,
     ):
         environment.filters[filter_.__name__] = filter_
+    environment.filters["distinct_names"] = distinct_names
     environment.filters["with_names"] = _with_names
     environment.filters["shortened"] = lambda name, length=60: shorten_name(name, length)
     environment.filters["one_line"] = lambda text: type(text)(re.sub("[ \n]+", " ", text).strip())

@@ -10,7 +10,7 @@ import click
 from click.core import ParameterSource
 
 from lidarsim.schema.vocabulary import UNITS_M
-from lidarsim.words import join_names
+from lidarsim.words import join_alternatives, join_names
 
 from . import shared_options as options
 from .terminal import Terminal
@@ -28,6 +28,7 @@ _SWEEP_OPTIONS = (
 _CLOUD_OPTIONS = ("sensor_a", "sensor_b", "unit_a", "unit_b", "max_points")
 _SURVEY_OPTIONS = ("up_axis", "radius_m", "max_distance_m")
 _STRIP_OPTIONS = ("cell_m", "max_roughness_m")
+_POINT_FILES = (".laz", ".las", ".ply", ".e57")  # formats of `--points`
 _SHARED = ("keep_noise", "on_progress")
 
 
@@ -142,6 +143,13 @@ _SHARED = ("keep_noise", "on_progress")
     help="Maximum standard deviation of points from the plane of their cell, in meters. With "
     "--survey strips.",
 )
+@click.option(
+    "--points",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Also write the deviation at each point to a .laz, .las, .ply or .e57 file, with its "
+    "level of detection. An existing file is replaced. With --survey.",
+)
 @options.as_json
 @click.pass_context
 def compare(
@@ -152,6 +160,7 @@ def compare(
     out: Path,
     as_json: bool,
     survey: str | None,
+    points: Path | None,
     **settings: Any,
 ) -> None:
     """Compare two point clouds or recordings of the same scene.
@@ -173,6 +182,7 @@ def compare(
       lidarpool compare simulated recorded --protocol lidar4d
       lidarpool compare noisy clean --survey pairs
       lidarpool compare scan.laz design.glb --survey mesh --max-distance 0.5
+      lidarpool compare after.e57 before.e57 --survey m3c2 --points change.laz
       lidarpool compare flight.laz --survey strips --cell 2
     """  # noqa: D301 - Click requires the character \b
     from ..processes.fork_server import keep_freed_memory
@@ -182,19 +192,27 @@ def compare(
             raise click.UsageError("Missing argument 'B'.")
         raise click.UsageError("More than two clouds require `--survey strips`.")
     if survey is None:
-        _reject_options(context, (*_SURVEY_OPTIONS, *_STRIP_OPTIONS), "requires `--survey`")
+        survey_only = (*_SURVEY_OPTIONS, *_STRIP_OPTIONS, "points")
+        _reject_options(context, survey_only, "requires `--survey`")
     elif survey == STRIPS:
         unused = (*_SWEEP_OPTIONS, *_CLOUD_OPTIONS, *_SURVEY_OPTIONS)
         _reject_options(context, unused, "cannot be used with `--survey strips`")
     else:
         _reject_options(context, _SWEEP_OPTIONS, "cannot be used with `--survey`")
         _reject_options(context, _STRIP_OPTIONS, "requires `--survey strips`")
+    if points is not None and points.suffix not in _POINT_FILES:
+        raise click.UsageError(
+            f"`--points` is {points}, but its extension must be {join_alternatives(_POINT_FILES)}."
+        )
     keep_freed_memory()
     with Terminal(as_json=as_json).writing("comparing the clouds", logged=False) as show:
         comparison = _compared(survey, a, others, settings | {"on_progress": show})
     page = next(path for path in comparison.save(out) if path.suffix == ".html")
     label = f"{'page':<{9 if survey is None else 10}}"
     lines = [repr(comparison), f"{label}{click.format_filename(page)}"]
+    if points is not None:
+        comparison.save_points(points)  # type: ignore[union-attr]  # it is one of surveys
+        lines.append(f"points    {click.format_filename(points)}")
     options.print_results(comparison.figures, lines, as_json)
 
 

@@ -197,7 +197,7 @@ def draw_rings(comparison: Comparison) -> Page:
     _draw_ring_residuals(page, axes, rings, limit)
     if has_gaps:
         axes = page.chart(frames[1], xlabel="cells without a return, %")
-        _draw_ring_gaps(page, axes, rings)
+        _draw_ring_gaps(page, axes, image["rings"])
     frame = frames[2] if has_gaps else frames[1]
     axes = page.chart(
         frame, xlabel="A − B, mm (outer bins include larger values)", ylabel="cells", yscale="log"
@@ -245,8 +245,10 @@ def _draw_ring_residuals(
 
 def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) -> None:
     """Draw each ring's percentage of cells without a return in A and in B."""
-    elevation = np.array([ring["elevation_deg"] for ring in rings])
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
+    has_returns = counts[:, 1:].any(axis=1)
+    counts = counts[has_returns]
+    elevation = np.array([ring["elevation_deg"] for ring in rings])[has_returns]
     style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
     for color, state, label in ((A_COLOR, 1, "A"), (B_COLOR, 2, "B")):
         fraction = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)

@@ -13,7 +13,7 @@ from lidarview.render.picture_page import Page
 from ..clouds.folder import result_folder, staging
 
 # Pictures of all kinds of comparisons.
-_PICTURES = ("ranges", "rings", "distances", "above", "map", "histogram")
+_PICTURES = ("ranges", "rings", "distances", "above", "map", "facades", "histogram")
 
 
 def write_comparison(

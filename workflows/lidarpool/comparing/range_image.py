@@ -16,7 +16,6 @@ import numpy as np
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
-from lidarsim.words import plural
 
 from .compared_sweep import RAY_KEY
 
@@ -350,10 +349,6 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
     row. Raises LidarError if the elevations of the rings differ.
     """
     numbers, notes = _ring_numbers(a, b)
-    if (unmatched := len(np.setxor1d(numbers, b.rings))) > 0:
-        notes.append(
-            f"{plural(unmatched, 'ring has', 'rings have')} returns in only one of the clouds"
-        )
     rings, first = np.unique(np.append(b.rings, numbers), return_index=True)
     elevation = np.append(b.ring_elevation, a.ring_elevation)[first]
     _check_elevations(a, b, numbers, names)

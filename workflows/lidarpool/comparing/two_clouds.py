@@ -20,7 +20,7 @@ from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.checks import check_choice, check_number
-from lidarsim.words import plural
+from lidarsim.words import join_names, plural
 
 from ..clouds.recording import Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
@@ -35,6 +35,8 @@ from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range
 MAX_POINTS = 10_000_000  # maximum number of points of each cloud in memory
 
 MAX_VALUES = 4_000_000  # maximum number of cells and points in all sweeps that are compared
+
+_LISTED_RINGS = 6  # maximum number of rings in a note
 
 
 def compare(
@@ -548,7 +550,8 @@ class _Comparing:
         """Return all notes. Recordings add notes when their poses and points are read."""
         recorded = [note for recording in self.recordings for note in recording.notes]
         omitted = [note for recording in self.recordings for note in recording.omission_notes]
-        notes = [*recorded, *self.notes, *self._empty_notes(), *self._image_notes(), *omitted]
+        own = [*self.notes, *self._empty_notes(), *self._image_notes(), *self._dead_ring_notes()]
+        notes = [*recorded, *own, *omitted]
         return list(dict.fromkeys(notes))
 
     def _empty_notes(self) -> list[str]:
@@ -575,6 +578,22 @@ class _Comparing:
             f"{instead}"
             for reason, count in self.without_images.items()
         ]
+
+    def _dead_ring_notes(self) -> list[str]:
+        """Return a note for each recording in which rings have no returns, unlike in the other."""
+        notes = []
+        for state, recording in zip((1, 2), self.recordings, strict=True):  # see `CELLS`
+            dead = [
+                f"{ring} ({elevation:.1f}°)" if ring >= 0 else f"at {elevation:.1f}°"
+                for ring, (elevation, counts) in self.rings.items()
+                if counts[state] and not counts[3] and not counts[3 - state]
+            ]
+            if dead:
+                rings = "ring" if len(dead) == 1 else "rings"
+                others = len(dead) - _LISTED_RINGS
+                listed = dead[:_LISTED_RINGS] + ([f"{others} others"] if others > 0 else [])
+                notes.append(f"{recording.name} has no returns in {rings} {join_names(listed)}")
+        return notes
 
     def _images(self) -> RangeImages | None:
         return None if self.ray_counts.any() else self.images

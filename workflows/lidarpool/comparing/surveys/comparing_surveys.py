@@ -274,4 +274,4 @@ def _summarize(
         **found.figures,
         "notes": list(dict.fromkeys([*own, *notes, *found.notes])),
     }
-    return SurveyComparison(figures, found.points, found.components)
+    return SurveyComparison(figures, found.points, found.components, found.columns)

@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Floats
 
+NORMAL = ("normal_x", "normal_y", "normal_z")
 STATISTICS = ("mean_m", "std_m", "rmse_m", "median_m", "p95_abs_m", "min_m", "max_m")
 
 
@@ -22,6 +23,13 @@ class Deviations:
     # Further entries of compare.json.
     figures: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    # Further values of shape (n,), such as `normal_x` and `level_of_detection`.
+    columns: dict[str, Floats] = field(default_factory=dict)
+
+
+def normal_columns(normals: Floats) -> dict[str, Floats]:
+    """Return the columns of normals, of shape (n, 3)."""
+    return dict(zip(NORMAL, normals.T, strict=True))
 
 
 def statistics(values: Floats) -> dict[str, Any]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 
 from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Floats
 
-from .deviations import Deviations
+from .deviations import Deviations, normal_columns
 from .orientation import OrientedPoints, nearby_scanners, thin_out
 from .survey_clouds import SurveyPoints
 
@@ -59,30 +61,38 @@ def m3c2_deviations(
         cyl_radius=radius_m,
         max_distance=max_distance_m,
     )
-    algorithm.corepoint_normals = OrientedPoints.from_normals(
+    normals = OrientedPoints.from_normals(
         core_points,
         np.asarray(algorithm.directions()),
         nearby_scanners(reference, rows, points),
         radius_m,
     ).normals
+    algorithm.corepoint_normals = normals
     distances, uncertainties = algorithm.run()
-    detection = np.asarray(uncertainties["lodetection"], np.float64)
     found = np.isfinite(distances)
+    detection = np.asarray(uncertainties["lodetection"], np.float64)
     if not found.any():
         raise LidarError(
             f"No core point has points of both clouds within a radius of {radius_m:g} m and a "
             f"distance of {max_distance_m:g} m. Increase `--radius` or `--max-distance`."
         )
-    has_level = found & np.isfinite(detection)
-    significant = has_level & (np.abs(distances) > detection)
     figures = {
         "radius_m": radius_m,
         "max_distance_m": max_distance_m,
         "without_counterpart": int(np.count_nonzero(~found)),
-        "level_of_detection": {
-            "core_points": int(np.count_nonzero(has_level)),
-            "median_m": float(np.median(detection[has_level])) if has_level.any() else None,
-            "significant": int(np.count_nonzero(significant)),
-        },
+        "level_of_detection": _level_figures(distances[found], detection[found]),
     }
-    return Deviations(core_points[found] + origin, {"distance": distances[found]}, figures)
+    columns = normal_columns(normals[found]) | {"level_of_detection": detection[found]}
+    return Deviations(
+        core_points[found] + origin, {"distance": distances[found]}, figures, columns=columns
+    )
+
+
+def _level_figures(distances: Floats, detection: Floats) -> dict[str, Any]:
+    """Return the median level of detection, and the number of distances that exceed it."""
+    has_level = np.isfinite(detection)
+    return {
+        "core_points": int(np.count_nonzero(has_level)),
+        "median_m": float(np.median(detection[has_level])) if has_level.any() else None,
+        "significant": int(np.count_nonzero(has_level & (np.abs(distances) > detection))),
+    }

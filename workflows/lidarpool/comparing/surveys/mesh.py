@@ -16,7 +16,7 @@ from lidarsim.scene.scene_instances import SceneInstance
 
 from ...open3d_access.open3d_module import load_open3d
 from ..compared_sweep import bounds_of, origin_to_add
-from .deviations import Deviations
+from .deviations import Deviations, normal_columns
 
 _BATCH = 200_000
 _HEAD_BYTES = 4096
@@ -69,12 +69,11 @@ def mesh_deviations(
     origin = corners.reshape(-1, 3).mean(axis=0)
     is_closed = _is_closed(corners)
     surface = _Surface(corners - origin, is_closed)
-    distances = np.concatenate(
-        [
-            surface.signed_distances(points[start : start + _BATCH] - origin)
-            for start in range(0, len(points), _BATCH)
-        ]
-    )
+    batches = [
+        surface.signed_distances(points[start : start + _BATCH] - origin)
+        for start in range(0, len(points), _BATCH)
+    ]
+    distances, normals = map(np.concatenate, zip(*batches, strict=True))
     near = np.abs(distances) <= max_distance_m
     if not near.any():
         nearest_m = float(np.abs(distances).min())
@@ -94,7 +93,8 @@ def mesh_deviations(
         "is_closed": is_closed,
         "without_counterpart": int(np.count_nonzero(~near)),
     }
-    return Deviations(points[near], {"distance": distances[near]}, figures, tuple(notes))
+    columns = normal_columns(normals[near])
+    return Deviations(points[near], {"distance": distances[near]}, figures, tuple(notes), columns)
 
 
 def _triangles(path: Path, notes: list[str], options: dict[str, Any]) -> Floats:
@@ -139,8 +139,8 @@ class _Surface:
         faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(core.Tensor(vertices), core.Tensor(faces))
 
-    def signed_distances(self, points: Floats) -> Floats:
-        """Return the signed distances of points, of shape (n,)."""
+    def signed_distances(self, points: Floats) -> tuple[Floats, Floats]:
+        """Return the signed distances of points, and the normals of the nearest triangles."""
         from trimesh.triangles import closest_point
 
         queries = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
@@ -152,7 +152,7 @@ class _Surface:
             is_inside = self._scene.compute_occupancy(queries, nsamples=3).numpy() > 0
         else:
             is_inside = self._is_behind(offsets, triangle)
-        return np.where(is_inside, -unsigned, unsigned)
+        return np.where(is_inside, -unsigned, unsigned), self._normals[triangle]
 
     def _is_behind(self, offsets: Floats, triangle: Ints) -> Bools:
         return np.asarray(np.einsum("ni,ni->n", offsets, self._normals[triangle]) < 0)

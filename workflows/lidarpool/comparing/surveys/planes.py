@@ -11,7 +11,7 @@ from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
 
 from ...open3d_access.neighbors import NeighborSearch
-from .deviations import Deviations
+from .deviations import Deviations, normal_columns
 from .orientation import OrientedPoints, nearby_scanners, thin_out
 from .survey_clouds import SurveyPoints
 
@@ -72,6 +72,7 @@ def plane_deviations(
     points = points.relative_to(origin)
     planes = _ReferencePlanes(reference.relative_to(origin), points, radius_m)
     distances, roughness = np.full((2, len(points)), np.nan)
+    normals = np.zeros((len(points), 3), np.float32)
     too_far = 0
     for start in range(0, len(points), _BATCH):
         rows = np.arange(start, min(start + _BATCH, len(points)))
@@ -79,7 +80,9 @@ def plane_deviations(
         is_near = separation[:, 0] <= max_distance_m
         too_far += int(np.count_nonzero(~is_near))
         rows = rows[is_near]
-        distances[rows], roughness[rows] = planes.distances(rows, nearest[is_near, 0])
+        distances[rows], roughness[rows], normals[rows] = planes.distances(
+            rows, nearest[is_near, 0]
+        )
     found = np.isfinite(distances)
     if not found.any():
         raise LidarError(
@@ -93,7 +96,10 @@ def plane_deviations(
         "without_counterpart": too_far,
         "without_plane": int(len(points) - found.sum() - too_far),
     }
-    return Deviations(points.positions[found] + origin, {"distance": distances[found]}, figures)
+    columns = normal_columns(normals[found]) | {"plane_rms": roughness[found]}
+    return Deviations(
+        points.positions[found] + origin, {"distance": distances[found]}, figures, columns=columns
+    )
 
 
 class _ReferencePlanes:
@@ -120,10 +126,10 @@ class _ReferencePlanes:
     def _fit(self, rows: Indices) -> _Planes:
         return _fit_planes(self.search, self._reference.positions, rows)
 
-    def distances(self, rows: Indices, nearest: Indices) -> tuple[Floats, Floats]:
-        """Return signed distances of points of A, and the RMS distances of the planes' own points.
+    def distances(self, rows: Indices, nearest: Indices) -> tuple[Floats, Floats, Floats]:
+        """Return distances of points of A, RMS distances of the planes' own points, and normals.
 
-        Both are NaN if the nearest reference point has no plane.
+        The distances are NaN if the nearest reference point has no plane.
 
         Parameters
         ----------
@@ -133,6 +139,7 @@ class _ReferencePlanes:
             Rows of the reference points that are nearest to them.
         """
         distances, rms_m = np.full((2, len(rows)), np.nan)
+        all_normals = np.zeros((len(rows), 3))
         planes = self._fit(nearest)
         valid = planes.are_valid
         if valid.any():
@@ -144,7 +151,8 @@ class _ReferencePlanes:
             offsets = self._points.positions[rows[valid]] - planes.centers
             distances[valid] = np.einsum("ni,ni->n", offsets, normals)
             rms_m[valid] = planes.rms_m
-        return distances, rms_m
+            all_normals[valid] = normals
+        return distances, rms_m, all_normals
 
 
 def _fit_planes(search: NeighborSearch, reference: Floats, rows: Indices) -> _Planes:

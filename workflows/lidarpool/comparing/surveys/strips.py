@@ -19,7 +19,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.motion.straight_lines import StraightLines
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
-from lidarsim.words import plural
+from lidarsim.words import distinct_names, plural
 
 from ...clouds.recording import Recording
 from .deviations import Deviations, statistics
@@ -81,11 +81,12 @@ class _Strips:
         for file, sensor, source in self.numbers:
             sensors[file].add(sensor)
             sources[file].add(source)
+        file_names = distinct_names([cloud.name for cloud in clouds])
         names = []
         for file, sensor, source in self.numbers:
             parts = []
             if len(clouds) > 1:
-                parts.append(clouds[file].name.rstrip("/").rpartition("/")[2])
+                parts.append(file_names[file])
             if len(sensors[file]) > 1:
                 parts.append(_sensor_name(clouds[file], sensor))
             if not parts or len(sources[file]) > 1:

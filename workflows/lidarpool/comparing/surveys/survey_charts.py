@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,8 @@ from lidarsim.numerics.arrays import Floats
 from lidarview.render import theme
 from lidarview.render.picture_page import Page
 
+from .deviations import NORMAL
+
 _WIDTH = 1600
 _LEFT = 0.075
 _RIGHT = 0.86
@@ -20,6 +22,7 @@ _GAP = 0.06  # between maps, as a fraction of the width
 _TOP = 150  # pixels
 _BOTTOM = 90
 _ROW_GAP = 80
+_FACADE_GAP = 110
 _MAX_HEIGHT = 620  # of a map, in pixels
 _COLORS = "RdBu_r"
 _MAPPED = ("delta_e", "delta_n", "delta_h", "distance")
@@ -27,8 +30,16 @@ _MAX_CELLS = 240  # cells of a map along its longer side
 _MIN_CELLS = 12
 _POINTS_PER_CELL = 4
 _WIDE = 1.6  # aspect ratio of an area above which its maps are drawn one below the other
+_OUTLIERS = 3  # cells that need not be in the color scale
 _MIN_LIMIT_M = 1e-4  # end of the color scale if there are no deviations
 _BINS = 80
+_STEEP = 0.5  # vertical component of the normals below which surfaces are facades
+_MIN_FACADE_SHARE = 0.05  # minimum share of the points on facades for which they are drawn
+_MIN_FACADE_POINTS = 100
+_MIN_SIDE_SHARE = 0.05  # minimum share of these points for which a side is drawn
+_COMPASS = (
+    *("north", "northeast", "east", "southeast", "south", "southwest", "west", "northwest"),
+)
 # Color of histogram bars.
 _BAR_COLOR = "#4477aa"
 
@@ -77,20 +88,26 @@ def draw_maps(
     layout = _MapLayout.for_area(len(names), area.width / area.height)
     page = Page((_WIDTH, layout.page_height))
     page.title("Map of deviations", f"mean of A − B in cells of {area.side:.3g} m")
-    limit = 1000 * _color_limit(grids)
+    limit = 1000 * _color_limit(grids, [components[name] for name in names])
     norm = Normalize(-limit, limit)
     limits = area.limits(layout.width / layout.height)
     for number, (name, grid) in enumerate(zip(names, grids, strict=True)):
-        axes = page.map_chart(layout.frame(number), limits, tick_count=8 if layout.rows > 1 else 4)
+        axes = page.map_chart(
+            layout.frame(number), limits, tick_count=8 if layout.columns == 1 else 4
+        )
         _name_axes(axes, with_north=number % layout.columns == 0)
         _draw_grid(axes, grid, area, norm)
         axes.set(xlim=limits[:, 0], ylim=limits[:, 1])
         page.heading(axes, labels[name])
-    ramp = theme.apply_colormap(_COLORS, np.linspace(0, 1, 256))
     bottom = layout.frame(len(names) - 1)[1]
-    top = layout.frame(0)[1] + layout.frame(0)[3]
-    page.color_bar(ramp, norm, "A − B, mm", (_RIGHT + 0.025, bottom, 0.014, top - bottom))
+    _draw_scale(page, norm, bottom, layout.frame(0)[1] + layout.frame(0)[3])
     return page
+
+
+def _draw_scale(page: Page, norm: Normalize, bottom: float, top: float) -> None:
+    """Draw the color scale of maps between two heights, as fractions of the page."""
+    ramp = theme.apply_colormap(_COLORS, np.linspace(0, 1, 256))
+    page.color_bar(ramp, norm, "A − B, mm", (_RIGHT + 0.025, bottom, 0.014, top - bottom))
 
 
 def _draw_grid(axes: Axes, grid: Floats, area: _Area, norm: Normalize) -> None:
@@ -122,8 +139,7 @@ class _Area(NamedTuple):
         """
         margin = (cell_m or 0.0) / 2
         lower, upper = positions.min(axis=0) - margin, positions.max(axis=0) + margin
-        extent_m = max(float((upper - lower).max()), 1e-3)
-        return cls(lower, upper, _cell_side(extent_m, len(positions), cell_m))
+        return cls(lower, upper, _cell_side(upper - lower, len(positions), cell_m))
 
     @property
     def width(self) -> float:
@@ -154,22 +170,113 @@ class _Area(NamedTuple):
         return np.stack([center - half, center + half])
 
 
-def _cell_side(extent_m: float, points: int, cell_m: float | None) -> float:
-    """Return the cell width of a map. It is a multiple of `cell_m`, if given."""
+def _cell_side(extent: Floats, points: int, cell_m: float | None) -> float:
+    """Return the cell width of a map with a given extent, of shape (2,).
+
+    It is a multiple of `cell_m`, if given.
+    """
+    longer_m = max(float(extent.max()), 1e-3)
     if cell_m is not None:
-        return cell_m * max(int(np.ceil(extent_m / cell_m / _MAX_CELLS)), 1)
-    return extent_m / float(np.clip(np.sqrt(points / _POINTS_PER_CELL), _MIN_CELLS, _MAX_CELLS))
+        return cell_m * max(int(np.ceil(longer_m / cell_m / _MAX_CELLS)), 1)
+    side_m = np.sqrt(_POINTS_PER_CELL * extent.prod() / points)
+    return float(np.clip(side_m, longer_m / _MAX_CELLS, longer_m / _MIN_CELLS))
 
 
-def _color_limit(grids: Sequence[Floats]) -> float:
-    means = np.abs(np.concatenate([grid[np.isfinite(grid)] for grid in grids]))
-    return max(float(np.quantile(means, 0.98)), _MIN_LIMIT_M)
+def _color_limit(grids: Sequence[Floats], deviations: Sequence[Floats]) -> float:
+    """Return the end of the color scale in meters.
+
+    It is the largest mean of a cell, so that it includes changes of small areas. If the means of
+    the `_OUTLIERS` largest cells exceed almost all deviations, it is the next smaller mean.
+    """
+    means = np.sort(np.abs(np.concatenate([grid[np.isfinite(grid)] for grid in grids])))
+    common = max(float(np.quantile(np.abs(values), 0.999)) for values in deviations)
+    next_mean = float(means[max(len(means) - 1 - _OUTLIERS, 0)])
+    return max(next_mean, min(float(means[-1]), common), _MIN_LIMIT_M)
 
 
 def _name_axes(axes: Axes, *, with_north: bool) -> None:
     """Name the axes of a map E and N instead of x and y."""
     axes.set_xlabel(axes.get_xlabel().replace("x", "E", 1))
     axes.set_ylabel(axes.get_ylabel().replace("y", "N", 1) if with_north else "")
+
+
+class _Facade(NamedTuple):
+    """Deviations of surfaces that face the same horizontal direction."""
+
+    name: str  # direction, such as "southwest"
+    positions: Floats  # (k, 2): distance from the left end and height, in meters
+    deviations: Floats  # (k,)
+
+    @property
+    def area(self) -> _Area:
+        return _Area.around(self.positions, None)
+
+    @property
+    def grid(self) -> Floats:
+        """Mean deviation in each cell, bottom first."""
+        return self.area.mean_grid(self.positions, self.deviations)
+
+    def height(self, width: float) -> float:
+        """Return the height of a chart with the given width, in pixels."""
+        return float(np.clip(width * self.area.height / self.area.width, 160, 380))
+
+
+def _find_facades(points: Floats, normals: Floats, deviations: Floats) -> Iterator[_Facade]:
+    """Yield the sides of a building or another object, which are at right angles to each other."""
+    rows = np.flatnonzero(np.abs(normals[:, 2]) < _STEEP)
+    if len(rows) < max(_MIN_FACADE_SHARE * len(points), _MIN_FACADE_POINTS):
+        return
+    azimuth = np.arctan2(normals[rows, 1], normals[rows, 0])
+    main = np.angle(np.exp(4j * azimuth).mean()) / 4  # directions that differ by 90° are the same
+    side = np.rint((azimuth - main) / (np.pi / 2)).astype(np.int64) % 4
+    for number in range(4):
+        chosen = rows[side == number]
+        if len(chosen) < _MIN_SIDE_SHARE * len(rows):
+            continue
+        x, y = np.cos(main + number * np.pi / 2), np.sin(main + number * np.pi / 2)
+        along = points[chosen, :2] @ [-y, x]  # to the right if seen from the front
+        positions = np.stack([along - along.min(), points[chosen, 2]], axis=1)
+        compass = round(np.degrees(np.arctan2(x, y)) / 45) % 8
+        yield _Facade(_COMPASS[compass], positions, deviations[chosen])
+
+
+def draw_facades(
+    points: Floats, components: Mapping[str, Floats], columns: Mapping[str, Floats]
+) -> Page | None:
+    """Draw the mean deviations of steep surfaces as seen from the front.
+
+    Returns None if there are hardly any steep surfaces, or if their normals are unknown.
+    """
+    if not {*NORMAL} <= {*columns} or "distance" not in components:
+        return None
+    normals = np.stack([columns[name] for name in NORMAL], axis=1)
+    facades = [*_find_facades(points, normals, components["distance"])]
+    if not facades:
+        return None
+    limit = 1000 * _color_limit(
+        [facade.grid for facade in facades], [facade.deviations for facade in facades]
+    )
+    norm = Normalize(-limit, limit)
+    width = (_RIGHT - _LEFT) * _WIDTH
+    heights = [facade.height(width) for facade in facades]
+    page_height = int(_TOP + sum(heights) + (len(heights) - 1) * _FACADE_GAP + _BOTTOM)
+    page = Page((_WIDTH, page_height))
+    side = max(facade.area.side for facade in facades)
+    page.title("Facades", f"mean of A − B in cells of up to {side:.3g} m, seen from the front")
+    top = float(page_height - _TOP)
+    for facade, height in zip(facades, heights, strict=True):
+        limits = facade.area.limits(width / height)
+        frame = (_LEFT, (top - height) / page_height, width / _WIDTH, height / page_height)
+        axes = page.map_chart(frame, limits, tick_count=12)
+        axes.set_xlabel("distance from the left end, m")
+        axes.set_ylabel(axes.get_ylabel().replace("y", "h", 1))
+        _draw_grid(axes, facade.grid, facade.area, norm)
+        axes.set(xlim=limits[:, 0], ylim=limits[:, 1])
+        page.heading(axes, f"facing {facade.name}")
+        top -= height + _FACADE_GAP
+    bottom = _BOTTOM / page_height
+    _draw_scale(page, norm, bottom, 1 - _TOP / page_height)
+    return page
 
 
 def draw_histograms(
