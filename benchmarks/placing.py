@@ -135,7 +135,8 @@ class Tasks:
             )
             self.scheduler.transitions({state.key: "forgotten"}, "benchmark")
         # In a partition, tasks wait on the scheduler until a slot is free.
-        self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id="benchmark")
+        if (shares := self.scheduler.plugins.get(SHARES)) is not None:
+            shares.dispatch()
 
 
 def cost_us(scheduler: Any, partition: bool, number: int) -> float:

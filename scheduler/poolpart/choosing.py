@@ -1,17 +1,17 @@
-"""Place tasks on workers in a time that does not depend on the size of the cluster.
+"""Place tasks without a partition in a time that does not depend on the size of the cluster.
 
-If a task requires a resource, or if a fence keeps it out of a partition, Dask compares all workers
-that may run it. This takes the scheduler several microseconds per worker (see
-`benchmarks.placing`). The rule in this module only compares a few of these workers, using Dask's
-own objective function. They are the first nonempty group of the following:
+If a fence keeps a task out of a partition, Dask compares all workers that may run it. This takes
+the scheduler several microseconds per worker (see `benchmarks.placing`). The rule in this module
+only compares a few of these workers, using Dask's own objective function. They are the first
+nonempty group of the following:
 
 - workers that hold inputs of the task;
-- workers with free slots, starting with the worker that has been free the longest;
+- workers with free threads, starting with the worker that has been free the longest;
 - if all workers are busy, some workers in rotation.
 
-The candidates come from one group of workers, which is a partition or, if there are fences, all
-workers outside fences. Dask still places tasks of small groups, tasks that are bound to workers or
-hosts, actors, and tasks with inputs on many workers. If this rule fails, Dask places all tasks.
+The candidates are the workers outside all fences. Dask still places tasks if there are few of them
+or no fences, tasks that are bound to workers or hosts, actors, and tasks with inputs on many
+workers. If this rule fails, Dask places all tasks. Tasks of partitions are placed by `shares`.
 """
 
 from __future__ import annotations
@@ -26,42 +26,38 @@ from .fence import Fences
 from .internals.method_rules import MethodRules, add_choice_rule
 from .internals.placing import (
     can_run,
-    count_declaring,
     earliest_worker,
-    free_slots_of,
+    free_threads_of,
     holders_of_inputs,
     only_resource_of,
-    workers_declaring,
 )
 
 NAME = "poolpart-choice"
 MAX_COMPARED = 10  # number of workers that are compared for a task
 _EXAMINED = 50  # number of workers that are examined for free slots
-_OUTSIDE = ""  # name of the group of workers outside all fences
+_WITHOUT_PARTITION: tuple[str, float] = ("", 1)  # resource of a task without a partition
 
 
 class _Group:
     """Group of workers that can run the same tasks."""
 
-    def __init__(self, name: str, version: Any, workers: list[Any]) -> None:
-        self.name = name
+    def __init__(self, version: Any, workers: list[Any]) -> None:
         self.version = version  # identifies the state of the cluster for which the group is valid
         self.workers = workers
         self.members = set(workers)
-        self.free = dict.fromkeys(workers)  # ordered set of workers that may have free slots
+        self.free = dict.fromkeys(workers)  # ordered set of workers that may have free threads
         self._next_index = 0  # index of the first worker in the next result of `in_turn`
 
-    def with_free_slots(self, slots: float) -> list[Any]:
-        """Return up to `MAX_COMPARED` workers with enough free slots.
+    def with_free_threads(self) -> list[Any]:
+        """Return up to `MAX_COMPARED` workers with free threads.
 
-        Workers without any free slot are removed from the set of free workers.
+        Workers without free threads are removed from the set of free workers.
         """
         workers: list[Any] = []
         for worker in list(islice(self.free, _EXAMINED)):
-            free = free_slots_of(worker, self.name)
-            if free >= slots:
+            if free_threads_of(worker) >= 1:
                 workers.append(worker)
-            elif free < 1:
+            else:
                 del self.free[worker]
             if len(workers) == MAX_COMPARED:
                 break
@@ -78,15 +74,14 @@ class _Group:
 
 
 class WorkerChooser(SchedulerPlugin):
-    """Scheduler plugin that chooses workers for tasks, considering partitions and fences."""
+    """Scheduler plugin that chooses workers for tasks outside of fences."""
 
     name = NAME
 
-    def __init__(self, scheduler: Any, names: set[str]) -> None:
+    def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.names = names  # names of the partitions, a set that the caller updates
-        self._changes = 0  # number of changes of the workers and their declared resources
-        self._groups: dict[str, _Group] = {}
+        self._changes = 0  # number of changes of the workers
+        self._outside: _Group | None = None  # workers outside all fences, if there are fences
         self._rules = MethodRules()
         add_choice_rule(self._rules, scheduler, self.choose)
         scheduler.add_plugin(self)
@@ -96,80 +91,65 @@ class WorkerChooser(SchedulerPlugin):
         self._rules.remove_all()
         self.scheduler.remove_plugin(NAME)
 
-    # -- groups ------------------------------------------------------------------------
+    # -- the group ---------------------------------------------------------------------
 
     def invalidate_groups(self) -> None:
-        """Invalidate all groups after a worker has changed its declared resources."""
+        """Invalidate the group after a worker has changed its declared resources."""
         self._changes += 1
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Invalidate all groups after a worker has joined."""
+        """Invalidate the group after a worker has joined."""
         self._changes += 1
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Delete all groups after a worker has left, so that they do not keep its state alive."""
+        """Delete the group after a worker has left, so that it does not keep its state alive."""
         self._changes += 1
-        self._groups.clear()
+        self._outside = None
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, worker: str = "", **kwargs: Any
     ) -> None:
-        """Record that a worker may have a free slot because a task has ended."""
-        if start == "processing" and (state := self.scheduler.workers.get(worker)):
-            for group in self._groups.values():
-                if state in group.members:
-                    group.free[state] = None
+        """Record that a worker may have a free thread because a task has ended."""
+        group = self._outside
+        if group is not None and start == "processing":
+            state = self.scheduler.workers.get(worker)
+            if state in group.members:
+                group.free[state] = None
 
-    def _group(self, name: str) -> _Group | None:
-        """Return the workers of a partition as a group, which is rebuilt after changes.
+    def _group(self) -> _Group | None:
+        """Return the workers outside fences as a group, which is rebuilt after changes.
 
-        For `_OUTSIDE`, the group contains the workers outside all fences. The result is None if
-        there are no fences.
+        The result is None if there are no fences.
         """
         fences: Fences | None = self.scheduler.plugins.get(FENCES)
-        if name != _OUTSIDE:
-            version = self._changes, count_declaring(self.scheduler, name)
-        elif fences is not None:
-            version = self._changes, fences.changes
-        else:
+        if fences is None:
             return None
-        group = self._groups.get(name)
-        if group is None or group.version != version:
-            group = self._groups[name] = _Group(name, version, self._members(name))
-        return group
-
-    def _members(self, name: str) -> list[Any]:
-        if name != _OUTSIDE:
-            return workers_declaring(self.scheduler, name)
-        enclosed: set[Any] = self.scheduler.plugins[FENCES].enclosed
-        return [worker for worker in self.scheduler.workers.values() if worker not in enclosed]
+        version = self._changes, fences.changes
+        if self._outside is None or self._outside.version != version:
+            workers = self.scheduler.workers.values()
+            outside = [worker for worker in workers if worker not in fences.enclosed]
+            self._outside = _Group(version, outside)
+        return self._outside
 
     # -- the rule ----------------------------------------------------------------------
 
     def choose(self, task: Any) -> Any:
         """Choose the worker for a task, or return NotImplemented to let Dask decide."""
-        resource = only_resource_of(task)
-        if resource is None:
+        if only_resource_of(task) != _WITHOUT_PARTITION:
             return NotImplemented
-        name, slots = resource
-        if name != _OUTSIDE and name not in self.names:
-            return NotImplemented
-        group = self._group(name)
+        group = self._group()
         if group is None or len(group.workers) <= 2 * MAX_COMPARED:
             return NotImplemented
         holders = holders_of_inputs(task)
         if len(holders) > _EXAMINED:
             return NotImplemented
-        workers = [worker for worker in holders if worker in group.members]
-        workers = self._permitted(workers, name, slots)
-        if not workers:
-            workers = self._permitted(group.with_free_slots(slots), name, slots)
-        if not workers:
-            workers = self._permitted(group.in_turn(), name, slots)
+        workers = self._permitted([worker for worker in holders if worker in group.members])
+        workers = workers or self._permitted(group.with_free_threads())
+        workers = workers or self._permitted(group.in_turn())
         return earliest_worker(self.scheduler, task, workers) if workers else NotImplemented
 
-    def _permitted(self, workers: list[Any], name: str, slots: float) -> list[Any]:
-        return [worker for worker in workers if can_run(self.scheduler, worker, name, slots)]
+    def _permitted(self, workers: list[Any]) -> list[Any]:
+        return [worker for worker in workers if can_run(self.scheduler, worker, "", 1)]
 
 
 def invalidate_groups(scheduler: Any) -> None:

@@ -20,18 +20,19 @@ of the slot time from then on.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
 UNKNOWN_S = 0.5  # expected running time of a task if the client has not finished a similar one
 LEARNING = 0.3  # weight of the latest running time in the moving average
 RECENT_S = 60.0  # shares and waiting times are averaged over about this time
-LEAD_S = 0.25  # a worker receives tasks in advance for up to this time per slot
-MAX_LEAD_TASKS = 16  # maximum number of slots' worth of tasks in advance, per slot
+DECAY_EVERY_S = 1.0  # interval between updates of these averages
+LEAD_S = 0.2  # a worker receives tasks in advance for up to this time per slot
+MAX_LEAD_TASKS = 64  # maximum number of tasks that it receives in advance, per slot
 
 
-def has_room(slots: float, used: float, assigned_s: float) -> bool:
+def has_room(slots: float, used: float, assigned_s: float, had_room: bool = False) -> bool:
     """Return whether a worker should receive another task now.
 
     A worker with a free slot should. If its tasks are short, a worker also receives tasks in
@@ -44,20 +45,24 @@ def has_room(slots: float, used: float, assigned_s: float) -> bool:
         Number of slots of the worker, and number of slots that its assigned tasks request.
     assigned_s
         Expected slot time of the tasks that are assigned to the worker, in seconds.
+    had_room
+        Whether the worker had room before. Otherwise, it has room again when half of the tasks that
+        it received in advance have ended. Several tasks in one message are cheaper.
 
     Examples
     --------
     >>> has_room(slots=1, used=0, assigned_s=0.0)
     True
-    >>> [has_room(slots=1, used=1, assigned_s=seconds) for seconds in (0.1, 10.0)]
+    >>> [has_room(slots=1, used=1, assigned_s=seconds) for seconds in (0.05, 10.0)]
     [True, False]
     """
     if used < slots:
         return True
-    return assigned_s < LEAD_S * slots and used < (1 + MAX_LEAD_TASKS) * slots
+    lead = slots if had_room else 0.5 * slots
+    return assigned_s < LEAD_S * lead and used < slots + MAX_LEAD_TASKS * lead
 
 
-@dataclass
+@dataclass(slots=True)
 class StartedTask:
     """Task that was assigned to a worker, and what its client was charged for it."""
 
@@ -71,7 +76,7 @@ class StartedTask:
     is_lent: bool = False  # whether the task has lent its slots
 
 
-@dataclass
+@dataclass(slots=True)
 class ClientAccount:
     """What a client has used, and what it is charged."""
 
@@ -118,7 +123,7 @@ class SharePolicy:
     >>> for client in ("alice", "bob"):
     ...     policy.add_waiting(client, now=0.0, tasks=100)
     >>> for number in range(8):
-    ...     _ = policy.start(number, next(policy.clients_in_turn()), "f", slots=1, now=0.0)
+    ...     _ = policy.start(number, policy.clients_in_turn()[0], "f", slots=1, now=0.0)
     >>> policy.accounts["alice"].slots, policy.accounts["bob"].slots
     (6.0, 2.0)
     """
@@ -151,12 +156,12 @@ class SharePolicy:
             if client not in present and not account.is_active and account.tag <= lowest:
                 del self.accounts[client]
 
-    def clients_in_turn(self) -> Iterator[str]:
-        """Iterate over the clients with waiting tasks, in the order in which they are next."""
-        waiting = [(a.tag, client) for client, a in self.accounts.items() if a.waiting]
+    def clients_in_turn(self) -> list[str]:
+        """Return the clients with waiting tasks, in the order in which they are next."""
+        waiting = [client for client, account in self.accounts.items() if account.waiting]
         if len(waiting) > 1:
-            waiting.sort()
-        return (client for _, client in waiting)
+            waiting.sort(key=lambda client: self.accounts[client].tag)
+        return waiting
 
     def fair_slots(self, client: str, slots: float) -> float:
         """Return how many of the slots a client would get now if all active clients wait."""
@@ -168,6 +173,10 @@ class SharePolicy:
         """Return the fraction of the recently used slot time that a client has used."""
         total = sum(account.recent_at_time(now) for account in self.accounts.values())
         return self.accounts[client].recent_at_time(now) / total if total else 0.0
+
+    def seconds_of(self, client: str, prefix: str) -> float:
+        """Return the expected running time of a client's tasks with a key prefix, in seconds."""
+        return self.accounts[client].durations.get(prefix, UNKNOWN_S)
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -215,7 +224,7 @@ class SharePolicy:
         account.started_tasks += 1
         account.waited_s += waited_s
         account.recent_wait_s += LEARNING * (waited_s - account.recent_wait_s)
-        expected_s = account.durations.get(prefix, UNKNOWN_S)
+        expected_s = self.seconds_of(client, prefix)
         task = StartedTask(client, prefix, slots, expected_s, now, expected_s)
         account.tag += slots * expected_s / account.weight
         self._add_run(account, task, 1)
@@ -252,12 +261,15 @@ class SharePolicy:
             account.slots = account.charged_s = account.since = 0.0
         used = task.slots * used_s
         account.seconds += used
-        account.recent_s = account.recent_at_time(now) + used
-        account.recent_at = now
+        if now - account.recent_at > DECAY_EVERY_S:
+            account.recent_s = account.recent_at_time(now)
+            account.recent_at = now
+        account.recent_s += used
         if seconds is not None:
             known_s = account.durations.get(task.prefix, used_s)
             account.durations[task.prefix] = known_s + LEARNING * (used_s - known_s)
-        self._update_floor()
+        if not account.is_active:
+            self._update_floor()
         return task
 
     def lend(self, key: Any, now: float) -> None:

@@ -25,7 +25,7 @@ import heapq
 import itertools
 import math
 import time
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -66,7 +66,7 @@ class _Bounds(NamedTuple):
 _ANY_WORKER = _Bounds()
 
 
-@dataclass
+@dataclass(slots=True)
 class _HeldTask:
     """Task that waits on the scheduler."""
 
@@ -76,7 +76,7 @@ class _HeldTask:
     task: Any
 
 
-@dataclass
+@dataclass(slots=True)
 class _Assignment:
     """Task that is assigned to a worker, with its contribution to the load of the worker."""
 
@@ -87,7 +87,7 @@ class _Assignment:
     is_lent: bool = False
 
 
-@dataclass
+@dataclass(slots=True)
 class _Load:
     """Slots that the assigned tasks of a worker request."""
 
@@ -129,12 +129,16 @@ class PartitionQueue:
             load = self.loads[worker] = _Load()
         # One nested task may wait in addition. Otherwise, nested tasks would keep tasks of other
         # clients off the worker.
-        if slots and has_room(slots, load.used - min(load.nested, 1), load.seconds):
-            self.with_room.setdefault(worker)
-        else:
-            self.with_room.pop(worker, None)
+        used = load.used - min(load.nested, 1) if load.nested else load.used
+        had_room = worker in self.with_room
+        if slots and has_room(slots, used, load.seconds, had_room):
+            if not had_room:
+                self.with_room[worker] = None
+        elif had_room:
+            del self.with_room[worker]
 
-        self._set_free(load, max(0.0, slots - load.used))
+        if load.free or load.used < slots:
+            self._set_free(load, max(0.0, slots - load.used))
 
     def forget_worker(self, worker: Any) -> None:
         """Forget a worker that has left. Its tasks have been released before."""
@@ -158,14 +162,11 @@ class PartitionQueue:
         self.assigned[key] = assignment
         self._add_load(assignment, 1)
 
-    def unassign(self, key: Any) -> bool:
-        """Remove a task from the load of its worker, and return whether it was assigned."""
-        assignment = self.assigned.pop(key, None)
-        if assignment is None:
-            return False
+    def unassign(self, key: Any) -> None:
+        """Remove a task from the load of its worker."""
+        assignment = self.assigned.pop(key)
         if not assignment.is_lent:
             self._add_load(assignment, -1)
-        return True
 
     def set_lent(self, key: Any, lent: bool) -> None:
         """Record that a task has lent its slots, or has them back."""
@@ -211,15 +212,17 @@ class PartitionQueue:
             self.nested_held -= held.bounds.is_nested
         return held
 
-    def heads(self, client: str) -> Iterator[_HeldTask]:
-        """Iterate over the first task of a client for each kind of bounds, in their order."""
+    def heads(self, client: str) -> list[_HeldTask]:
+        """Return the first task of a client for each kind of bounds, in their order."""
         heaps = self.heaps.get(client, {})
         heads: list[tuple[Any, int, _HeldTask]] = []
-        for number, (bounds, heap) in enumerate([*heaps.items()]):
+        for bounds in [*heaps]:
+            heap = heaps[bounds]
             while heap:
-                held = self.held.get(heap[0][2])
+                priority, number, key = heap[0]
+                held = self.held.get(key)
                 if held is not None and held.client == client and held.bounds == bounds:
-                    heads.append((heap[0][0], number, held))
+                    heads.append((priority, number, held))
                     break
                 heapq.heappop(heap)
             else:
@@ -228,7 +231,7 @@ class PartitionQueue:
             self.heaps.pop(client, None)
         if len(heads) > 1:
             heads.sort()
-        return (held for _, _, held in heads)
+        return [held for _, _, held in heads]
 
 
 class Shares(SchedulerPlugin):
@@ -241,11 +244,14 @@ class Shares(SchedulerPlugin):
         self.queues: dict[str, PartitionQueue] = {}
         self.weights: dict[str, float] = {}
         self._clients: dict[Any, str] = {}  # {task key: name of its client}
+        self._assigned_in: dict[Any, PartitionQueue] = {}  # {task key: queue of its partition}
         self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
         self._numbers = itertools.count()  # numbers of assignments
         self._check: asyncio.TimerHandle | None = None
         self._is_dispatch_due = False  # whether a dispatch is scheduled
+        self._present: set[str] = set()  # names of connected clients
         self._rules = MethodRules()
+        self._update_present()
         scheduler.add_plugin(self)
 
     def add_partition(self, name: str) -> None:
@@ -257,7 +263,6 @@ class Shares(SchedulerPlugin):
                 choose=self.choose,
                 is_held=self._is_held,
                 admit=self._admit,
-                dispatch=self.dispatch,
             )
         queue = self.queues[name] = PartitionQueue(name)
         for client, weight in self.weights.items():
@@ -273,6 +278,8 @@ class Shares(SchedulerPlugin):
     def remove_partition(self, name: str) -> None:
         """Assign the held tasks of a partition at once, and leave its tasks to Dask."""
         queue = self.queues.pop(name)
+        for key in queue.assigned:
+            del self._assigned_in[key]
         assign_held_tasks(self.scheduler, [held.task for held in queue.held.values()])
         if not self.queues:
             self._rules.remove_all()
@@ -318,28 +325,35 @@ class Shares(SchedulerPlugin):
         If the client has left, the task counts for another client that wants it.
         """
         client = self._clients.get(task.key)
-        if client is not None and (client in self._present() or not task.who_wants):
+        if client is not None and (client in self._present or not task.who_wants):
             return client
         wanted_by = sorted(client_name(state.client_key) for state in task.who_wants or ())
         client = next(iter(wanted_by), client or "")
         self._clients[task.key] = client
         return client
 
-    def _present(self) -> Set[str]:
-        if self._present_version != (version := (*self.scheduler.clients,)):
-            self._present_version = version
-            self._present_names = {client_name(client) for client in version}
-        return self._present_names
+    def _update_present(self) -> None:
+        self._present = {client_name(client) for client in self.scheduler.clients}
 
-    _present_version: tuple[str, ...] = ()
-    _present_names: Set[str] = frozenset()
+    def add_client(self, scheduler: Any, client: str) -> None:
+        """Record that a client has connected."""
+        self._update_present()
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Let held tasks of a client that has left count for other clients that want them."""
+        self._update_present()
+        name = client_name(client)
+        if name not in self._present:
+            for queue in self.queues.values():
+                self._hand_over(queue, name)
 
     # -- events of the scheduler -------------------------------------------------------
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
         """Update the accounts after a task has ended or no longer waits."""
         if start == "processing":
-            self._end(key, finish, kwargs)
+            if (queue := self._assigned_in.pop(key, None)) is not None:
+                self._end(queue, key, finish, kwargs)
         elif start == "no-worker" and finish != "processing":
             for queue in self.queues.values():
                 if held := queue.release(key):
@@ -347,17 +361,17 @@ class Shares(SchedulerPlugin):
         if finish == "forgotten":
             self._clients.pop(key, None)
 
-    def _end(self, key: Any, finish: str, report: dict[str, Any]) -> None:
-        for queue in self.queues.values():
-            if queue.unassign(key):
-                seconds = None
-                if finish in ("memory", "erred"):
-                    spans = report.get("startstops") or ()
-                    computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
-                    seconds = sum(computing) if computing else None
-                queue.policy.finish(key, time.monotonic(), seconds)
-                if seconds is None:  # Dask may not call `dispatch`, for example after a cancel
-                    self._dispatch_soon()
+    def _end(self, queue: PartitionQueue, key: Any, finish: str, report: Mapping[str, Any]) -> None:
+        """Charge a client for the time that its task has run."""
+        queue.unassign(key)
+        seconds = None
+        if finish in ("memory", "erred"):
+            spans = report.get("startstops") or ()
+            computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
+            seconds = sum(computing) if computing else None
+        queue.policy.finish(key, time.monotonic(), seconds)
+        if queue.held and queue.with_room:
+            self._dispatch_soon()
 
     def log_event(self, topic: str, msg: Any) -> None:
         """Record that a task has lent its slots, or has them back."""
@@ -383,6 +397,7 @@ class Shares(SchedulerPlugin):
 
     def restart(self, scheduler: Any) -> None:
         """Forget all tasks after `Client.restart`. Clients keep their weights."""
+        self._assigned_in.clear()
         for name in [*self.queues]:
             self.add_partition(name)
         self._clients.clear()
@@ -449,6 +464,7 @@ class Shares(SchedulerPlugin):
         is_nested = submitter_of(task) is not None
         seconds = slots * charge.expected_s
         queue.assign(task.key, _Assignment(worker, slots, seconds, is_nested))
+        self._assigned_in[task.key] = queue
         task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))
 
     def _worker_for(self, queue: PartitionQueue, task: Any, bounds: _Bounds) -> Any:
@@ -514,16 +530,13 @@ class Shares(SchedulerPlugin):
 
     def _dispatch_soon(self) -> None:
         """Assign tasks after the scheduler has finished its present step."""
-        if not self._is_dispatch_due and any(queue.held for queue in self.queues.values()):
+        if not self._is_dispatch_due:
             self._is_dispatch_due = True
-            asyncio.get_running_loop().call_soon(self._dispatch_due)
-
-    def _dispatch_due(self) -> None:
-        self._is_dispatch_due = False
-        self.dispatch()
+            asyncio.get_running_loop().call_soon(self.dispatch)
 
     def dispatch(self) -> None:
         """Assign held tasks to workers with room, as long as there are both."""
+        self._is_dispatch_due = False
         for queue in self.queues.values():
             if queue.held and (queue.with_room or queue.nested_held):
                 self._dispatch_from(queue)
@@ -547,8 +560,6 @@ class Shares(SchedulerPlugin):
         """Return the next task that can be assigned, its worker, and clients passed over."""
         passed_over: list[str] = []
         for client in queue.policy.clients_in_turn():
-            if client not in self._present():
-                self._hand_over(queue, client)
             for held in queue.heads(client):
                 if not (queue.with_room or held.bounds.is_nested):
                     continue
@@ -588,7 +599,7 @@ class Shares(SchedulerPlugin):
                     queue.move(key, worker)
             for worker in [*queue.loads]:
                 queue.update_worker(worker)
-            queue.policy.remove_idle(self._present(), now)
+            queue.policy.remove_idle(self._present, now)
             if queue.loads:  # otherwise, there are no workers
                 refresh_waiting_times(self.scheduler, [held.task for held in queue.held.values()])
         self._dispatch_soon()

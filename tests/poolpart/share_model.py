@@ -44,9 +44,10 @@ class SharedPartition:
         self.time = 0.0
         self.events = []  # heap of (time, number, function, arguments)
         self.number = 0
-        self.runs = []  # (user, start, end, slots)
+        self.runs = []  # (user, start, end, slots, number of the worker)
         self.longest_s = 0.0
         self.open = set(range(workers))
+        self.assigned = {}  # {key: (number of the worker, user)}
 
     def run(self, until):
         for user in self.users.values():
@@ -68,7 +69,7 @@ class SharedPartition:
         """Return the slot time that a user, or everyone, has used in an interval."""
         return sum(
             max(0.0, min(until, end) - max(since, start)) * slots
-            for name, since, until, slots in self.runs
+            for name, since, until, slots, _ in self.runs
             if user in (None, name) and since < end and until > start
         )
 
@@ -105,12 +106,14 @@ class SharedPartition:
         self._dispatch()
 
     def _dispatch(self):
-        while self.open and (name := next(self.policy.clients_in_turn(), None)):
+        while self.open and (names := self.policy.clients_in_turn()):
+            name = names[0]
             number = min(self.open, key=lambda n: self.workers[n].used / self.workers[n].slots)
             user = self.users[name]
             self.number += 1
             key = self.number
             charge = self.policy.start(key, name, user.prefix, user.slots, self.time)
+            self.assigned[key] = number, user
             self._assign(number, user.slots, charge.slots * charge.expected_s)
             self._at(self.time + MESSAGE_S, self._receive, number, key, user, charge)
 
@@ -118,14 +121,15 @@ class SharedPartition:
         worker = self.workers[number]
         worker.used += slots
         worker.assigned_s += seconds
-        if has_room(worker.slots, worker.used, worker.assigned_s):
+        if has_room(worker.slots, worker.used, worker.assigned_s, number in self.open):
             self.open.add(number)
         else:
             self.open.discard(number)
 
     def _receive(self, number, key, user, charge):
-        self.workers[number].queue.append((key, user, charge))
-        self._begin(number)
+        if key in self.assigned:
+            self.workers[number].queue.append((key, user, charge))
+            self._begin(number)
 
     def _begin(self, number):
         worker = self.workers[number]
@@ -134,17 +138,36 @@ class SharedPartition:
             worker.free -= user.slots
             seconds = user.task_s()
             self.longest_s = max(self.longest_s, seconds)
-            self.runs.append((user.name, self.time, self.time + seconds, user.slots))
+            self.runs.append((user.name, self.time, self.time + seconds, user.slots, number))
             self._at(self.time + seconds, self._end, number, key, user, charge, seconds)
 
     def _end(self, number, key, user, charge, seconds):
+        if key not in self.assigned:
+            return
         self.workers[number].free += user.slots
         self._begin(number)
         self._at(self.time + MESSAGE_S, self._finish, number, key, user, charge, seconds)
 
+    def _lose(self, number):
+        """Lose the tasks of a worker, which wait again, and start it again at once."""
+        worker = self.workers[number] = Worker(self.workers[number].slots)
+        worker.free = worker.slots
+        self.open.add(number)
+        self.runs = [
+            (name, since, min(until, self.time) if on == number else until, slots, on)
+            for name, since, until, slots, on in self.runs
+        ]
+        for key, (on, user) in list(self.assigned.items()):
+            if on == number:
+                del self.assigned[key]
+                self.policy.finish(key, self.time, None)
+                self.policy.add_waiting(user.name, self.time)
+        self._dispatch()
+
     def _finish(self, number, key, user, charge, seconds):
-        if self.policy.finish(key, self.time, seconds) is None:
+        if self.assigned.pop(key, None) is None:
             return
+        self.policy.finish(key, self.time, seconds)
         user.unfinished -= 1
         self._assign(number, -user.slots, -charge.slots * charge.expected_s)
         self._supply(user)

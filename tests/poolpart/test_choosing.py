@@ -125,7 +125,7 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
 def test_dask_decides_within_the_fence_if_the_rule_fails(
     client, parts, monkeypatch, caplog, caught_errors
 ):
-    monkeypatch.delattr("poolpart.choosing.free_slots_of")
+    monkeypatch.delattr("poolpart.choosing.free_threads_of")
     members = {worker.name for worker in parts["A"].workers}
     assert {parts["A"].submit(worker_name).result(LONG_S) for _ in range(10)} <= members
     assert (

@@ -56,7 +56,10 @@ def broken():
 def client(request):
     workers = {NASTY: {"resources": {"A": 2}}, "plain": {"nthreads": 2}}
     options = {"dashboard": request.param}
-    with cluster_of(workers, options, host="127.0.0.1") as cluster, Client(cluster) as client:
+    with (
+        cluster_of(workers, options, host="127.0.0.1") as cluster,
+        Client(cluster, name="alice") as client,
+    ):
         yield client
 
 
@@ -69,7 +72,7 @@ def test_the_page_of_a_partition_shows_only_the_partition(client):
         assert url == f"{pool.page()}?partition=A"
         assert rows["A"][:2] == ["1", "2"]
         assert rows[NASTY][0] == "A"
-        assert {*rows} == {"A", NASTY, "work"}
+        assert {*rows} == {"A", NASTY, "work", "alice"}
         assert {"plain", "to nobody"} <= rows_of(pool.page()).keys()
     assert rows_of(url.replace("=A", "=B"))["B"][0] == "0"
     pool.leave_page()
@@ -121,6 +124,7 @@ def test_what_it_tells(client, wait_until):
     assert (no_partition[:3], no_partition[6]) == (["0", "0", "0"], "3")
     assert (rows["broken"][0], rows["broken"][5]) == ("A", "1")
     assert rows[NASTY][:2] == ["A", "2"]
+    assert rows["alice"][:3] == ["A", "1", "100%"]  # weight and share
     assert "<script>" not in get(url)[2]  # names of users stay text
     assert rows["plain"][:3] == ["P", "2", "0"]
     assert "P (exclusive)" in rows

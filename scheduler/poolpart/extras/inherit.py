@@ -122,7 +122,7 @@ class Inheritance(SchedulerPlugin):
         add_shuffle_rule(self._rules, self.scheduler)
 
     def _choose(self) -> None:
-        self._choice = WorkerChooser(self.scheduler, self.names)
+        self._choice = WorkerChooser(self.scheduler)
 
     def _read(self) -> None:
         self._unreadable = UnreadableInputs(self.scheduler, self.names)

@@ -19,7 +19,6 @@ def add_holding_rules(
     choose: Callable[[Any], Any],
     is_held: Callable[[Any], bool],
     admit: Callable[[Any], None],
-    dispatch: Callable[[], None],
 ) -> None:
     """Let poolpart decide when tasks are assigned to workers.
 
@@ -34,8 +33,6 @@ def add_holding_rules(
         Function that returns whether a task in this state is held.
     admit
         Function that is called with a worker that has joined, resumed, or received resources.
-    dispatch
-        Function that is called after each step in which slots may have become free.
 
     Raises
     ------
@@ -52,15 +49,10 @@ def add_holding_rules(
         waiting.sort(key=lambda task: task.priority, reverse=True)
         return {task.key: "processing" for task in waiting}
 
-    def dispatch_after(result: Any, **_: Any) -> Any:
-        dispatch()
-        return result
-
     rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
     rules.call_instead(
         scheduler, "bulk_schedule_unrunnable_after_adding_worker", schedule_other_tasks, "ws"
     )
-    rules.call_after(scheduler, "stimulus_queue_slots_maybe_opened", dispatch_after, "stimulus_id")
 
 
 def _may_run(scheduler: Any, task: Any, worker: Any) -> bool:

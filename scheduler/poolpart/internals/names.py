@@ -201,7 +201,6 @@ PRIVATE_NAMES = (
         (
             f"{_SCHEDULER}.decide_worker_non_rootish(ts)",
             f"{_SCHEDULER}.bulk_schedule_unrunnable_after_adding_worker(ws)",
-            f"{_SCHEDULER}.stimulus_queue_slots_maybe_opened(stimulus_id)",
             f"{_SCHEDULER}.transitions",
             f"{_SCHEDULER}.unrunnable",
             f"{_SCHEDULER}.no_workers_timeout",

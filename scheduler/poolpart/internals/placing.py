@@ -28,16 +28,9 @@ def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
     return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
 
 
-def count_declaring(scheduler: Any, name: str) -> int:
-    """Return the number of workers that declare a resource."""
-    return len(scheduler.resources.get(name, ()))
-
-
-def free_slots_of(worker: Any, name: str) -> float:
-    """Return a worker's free slots for a resource, or its free threads if `name` is ""."""
-    if not name:
-        return float(worker.nthreads - len(worker.processing) + len(worker.long_running))
-    return float(worker.resources.get(name, 0) - worker.used_resources.get(name, 0))
+def free_threads_of(worker: Any) -> int:
+    """Return the number of a worker's threads without a task."""
+    return int(worker.nthreads - len(worker.processing) + len(worker.long_running))
 
 
 def can_run(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
