@@ -512,6 +512,51 @@ def test_utm_zones(longitude, latitude, epsg):
     assert utm_epsg(shape) == epsg
 
 
+def test_geojson_has_the_values_of_each_line(scanner):
+    """The ground rises along x, below lines that cross it at two heights."""
+    slope = quad("Slope", (-500, -500, 0), (1500, -500, 100), (1500, 1500, 100), (-500, 1500, 0))
+    ground = Terrain(Scene.from_meshes([slope]))
+    plan = planned(scanner, shapely.box(0, 0, 800, 400), ground, heading_deg=90, cross=2)
+    assert plan.counts == "1 flight line and 2 cross strips"
+    assert planned(scanner, shapely.box(0, 0, 800, 400)).counts == "1 flight line"
+    assert plan.length_m == pytest.approx(804 + 2 * 404)
+    assert plan.duration_s == plan.path.times_s[-1] > plan.length_m / plan.rates.speed_m_s
+    assert plan.farthest_m == pytest.approx(plan.highest_m / math.cos(math.radians(30)))
+    assert plan.is_in_range and not planned(scanner, agl_m=5500).is_in_range
+    content = json.loads(to_geojson(plan, None, np.zeros(3)))
+    by_name = {feature["properties"]["name"]: feature for feature in content["features"]}
+    assert [*by_name] == ["area", "line-1", "cross-1", "cross-2", "path"]
+    assert by_name["area"]["properties"]["agl_m"] == 500
+    line, values = plan.lines[0], by_name["line-1"]["properties"]
+    assert (values["kind"], by_name["cross-2"]["properties"]["kind"]) == ("line", "cross")
+    low_m, mean_m, high_m = line.clearance_m
+    assert high_m - low_m == pytest.approx(804 * 0.05, abs=0.1)
+    assert (values["min_clearance_m"], values["max_clearance_m"]) == pytest.approx(
+        (low_m, high_m), abs=0.01
+    )
+    swaths = tuple(2 * height_m * math.tan(math.radians(30)) for height_m in (low_m, high_m))
+    assert (values["min_swath_m"], values["max_swath_m"]) == pytest.approx(swaths, abs=0.01)
+    rates = plan.rates
+    assert values["max_density_m2"] == pytest.approx(
+        rates.pulses_hz / rates.speed_m_s / swaths[0], abs=1e-3
+    )
+    assert values["min_density_m2"] == pytest.approx(
+        rates.pulses_hz / rates.speed_m_s / swaths[1], abs=1e-3
+    )
+    assert values["length_m"] == 804 and values["speed_m_s"] == rates.speed_m_s
+    starts_s = [by_name[line.name]["properties"]["start_s"] for line in plan.lines]
+    assert starts_s == pytest.approx(plan.path.starts_s, abs=1e-3) and starts_s[0] == 5
+    ends = np.array(by_name["line-1"]["geometry"]["coordinates"])[[0, -1]]
+    np.testing.assert_allclose(ends, [(-2, 200, mean_m + 45), (802, 200, mean_m + 45)], atol=0.05)
+    crossing = np.array(by_name["cross-1"]["geometry"]["coordinates"])
+    assert len(crossing) == 2 and crossing[0, 0] == pytest.approx(600)
+    path = by_name["path"]
+    assert path["properties"]["duration_s"] == pytest.approx(plan.duration_s, abs=0.05)
+    np.testing.assert_allclose(
+        path["geometry"]["coordinates"][0], plan.path.positions[0], atol=1e-3
+    )
+
+
 @pytest.mark.extended
 def test_geojson_and_kml_are_in_longitudes_and_latitudes(scanner):
     plan = planned(scanner, shapely.box(0, 0, 800, 400), cross=1)
