@@ -49,7 +49,7 @@ from ..recording import Recording, RecordingSource, sweep_from_columns
 from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
-_LAYOUT_KEY = "lidarpool_layout"  # custom data of bags that were written by lidarpool
+_LAYOUT_KEY = "lidarpool_layout"  # custom data of simulated bags
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _LABEL_TOPIC = "/label_info"
 _LABELS = "vision_msgs/msg/LabelInfo"
@@ -133,7 +133,9 @@ class Rosbag2(CloudFormat):
         # ROS 2 Humble cannot read later versions, because QoS profiles are lists from version 9 on.
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
             bag.set_custom_data("lidarpool", self.sweeps.frame_text(compensated=spec.compensated))
-            bag.set_custom_data(_LAYOUT_KEY, spec.layout)
+            # Intensities of converted recordings, whose return mode is unknown, are not energies.
+            if self.sweeps.lidars and all(traits.mode for traits in self.sweeps.lidars):
+                bag.set_custom_data(_LAYOUT_KEY, spec.layout)
             topics: dict[str, Any] = {}
             for message in survey_messages(
                 self.cloud, self.sweeps, message_layout, spec.pose_rate_hz
@@ -431,7 +433,7 @@ def _custom_data(path: Path) -> str:
 
 
 def _energy_unit(custom_data: str, connection: Any, intensity: str | None) -> float | None:
-    """Return the intensity of a white surface at 10 m in a bag that was written by lidarpool.
+    """Return the intensity of a white surface at 10 m in a bag that lidarpool has simulated.
 
     Returns None for other bags and for messages whose intensities are not energies. `intensity` is
     the column that the user chose.
