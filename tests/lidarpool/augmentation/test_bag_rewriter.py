@@ -123,6 +123,9 @@ def test_boxes_are_markers(written, tmp_path):
         if boxes:
             center = boxes[0].pose.position
             assert (center.x, center.y, center.z) == (10, 2, -1)
+            turns = [box.pose.orientation for box in boxes]
+            found = [(turn.x, turn.y, turn.z, turn.w) for turn in turns]
+            np.testing.assert_allclose(found, two_boxes().quaternions)
             assert (boxes[0].scale.x, boxes[0].scale.y, boxes[0].scale.z) == (4, 2, 1.5)
     # A bag that was augmented before has another topic for the new boxes.
     again = tmp_path / "again"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -220,6 +221,37 @@ def test_labels_of_the_object_benchmark(benchmark, tmp_path):
     assert any("2 of 4 boxes of inserted objects were not labeled" in note for note in notes)
     image = "image_2/000000.png"
     assert (tmp_path / "new" / image).stat().st_ino == (folder / image).stat().st_ino
+
+
+@pytest.mark.parametrize(("heading_deg", "y_m"), [(0, 2), (35, 2), (-50, -3), (-120, 1), (170, -2)])
+def test_headings_of_labels_in_the_object_benchmark(benchmark, tmp_path, heading_deg, y_m):
+    """The sensor is not level, and the car is on either side of it."""
+    folder, to_camera = benchmark
+    heading, center = np.radians(heading_deg), np.array([14.0, y_m, -1.0])
+    boxes = two_boxes(points=(9, 0))
+    quaternions = np.array([[0, 0, np.sin(heading / 2), np.cos(heading / 2)], [0, 0, 0, 1]])
+    boxes = replace(boxes, quaternions=quaternions, centers=np.array([center, [30, 0, 0]]))
+    augment = partial(changed, boxes=boxes, visibility=[0.5, 1.0])
+    rewrite(opened(folder), tmp_path / "new", tmp_path / "work", augment)
+    label = (tmp_path / "new/label_2/000000.txt").read_text().splitlines()[-1]
+    kind, _, occlusion, *numbers = label.split()
+    assert (kind, occlusion) == ("Car", "1")
+    alpha, left, top, right, bottom, *size, x, y, z, rotation_y = map(float, numbers)
+    assert size == [1.5, 2.0, 4.0]
+    np.testing.assert_allclose([x, y, z], to_camera @ [*center, 1] + [0, 0.75, 0], atol=1e-4)
+    # The x axis of the camera points to the right, and its z axis forward, turned by 0.01.
+    expected = np.angle(np.exp(1j * (-heading - np.pi / 2 + 0.01)))
+    assert np.angle(np.exp(1j * (rotation_y - expected))) == pytest.approx(0, abs=1e-3)
+    assert alpha == pytest.approx(np.angle(np.exp(1j * (rotation_y - np.arctan2(x, z)))), abs=1e-3)
+    cos, sin = np.cos(heading), np.sin(heading)
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    corners = signs * [2, 1, 0.75] @ turn.T + center
+    pixels = np.column_stack([corners, np.ones(8)]) @ to_camera.T
+    pixels = np.column_stack([pixels, np.ones(8)]) @ P2.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    np.testing.assert_allclose([left, top], pixels.min(axis=0), atol=1e-3)
+    np.testing.assert_allclose([right, bottom], pixels.max(axis=0), atol=1e-3)
 
 
 def test_open3d_ml_reads_the_box_of_an_inserted_car(benchmark, tmp_path):

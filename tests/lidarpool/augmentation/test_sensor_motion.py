@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from lidarpool import LidarError
+from lidarpool import LidarError, box
+from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.ground_plane import GroundPlane
+from lidarpool.augmentation.inserted_objects import InsertedObjects
 from lidarpool.augmentation.sensor_motion import SensorMotion
 from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
@@ -128,6 +132,36 @@ def test_the_ground_is_a_plane_around_the_object(slope_x, slope_y, x_m, y_m):
     assert z_m == pytest.approx(-1.7 + slope_x * x_m + slope_y * y_m, abs=0.01)
     expected = np.array([-slope_x, -slope_y, 1.0])
     np.testing.assert_allclose(up, expected / np.linalg.norm(expected), atol=0.01)
+
+
+@pytest.mark.parametrize("heading_deg", [0, 40, -130])
+def test_objects_are_inclined_like_the_ground(heading_deg):
+    """The second object has a height, so it is level."""
+    slope_x, slope_y = 0.06, -0.03
+    recording = Recording("drive", 1, lambda _: ground(slope_x, slope_y))
+    car = box("Car", (4.5, 1.8, 1.5))
+    raised = replace(
+        car, vertices=np.add(car.vertices, [0, 0, 0.3])
+    )  # its lowest point is not at 0
+    effects = Effects(
+        insertions=(Insertion(raised, 6, -3, heading_deg=heading_deg), Insertion(car, -5, 7, -1.2))
+    )
+    objects = InsertedObjects.from_effects(recording, effects, SensorMotion(recording))
+    pose, level = objects.placed[0], objects.placed[1]
+    up = np.array([-slope_x, -slope_y, 1]) / np.linalg.norm([-slope_x, -slope_y, 1])
+    heading = np.radians(heading_deg)
+    forward = np.array([np.cos(heading), np.sin(heading), 0])
+    forward -= up * (up @ forward)
+    forward /= np.linalg.norm(forward)
+    expected = np.column_stack([forward, np.cross(up, forward), up])
+    np.testing.assert_allclose(pose[:3, :3], expected, atol=0.01)
+    vertices = raised.vertices @ pose[:3, :3].T + pose[:3, 3]
+    above = vertices[:, 2] - (-1.7 + slope_x * vertices[:, 0] + slope_y * vertices[:, 1])
+    np.testing.assert_allclose(np.sort(above)[:4], 0, atol=0.02)
+    np.testing.assert_allclose(np.sort(above)[4:], 1.5, atol=0.02)
+    np.testing.assert_allclose(level, [[1, 0, 0, -5], [0, 1, 0, 7], [0, 0, 1, -1.2], [0, 0, 0, 1]])
+    assert objects.names == ("Car", "Car_2")
+    assert objects.notes[0].endswith("unknown, so inserted objects move with the sensor.")
 
 
 def test_unknown_ground_is_refused():
