@@ -61,6 +61,59 @@ def test_slots_per_worker_count():
     assert divide_by_demand(samples, {"A": 8, "B": 8}) == {"A": 4, "B": 8}
 
 
+def samples_at(tick, a, b):
+    """Samples of two partitions, each given as (workers, slots, tasks per tick, waiting tasks)."""
+    return {
+        name: LoadSample(
+            workers,
+            slots=slots,
+            finished=rate * tick,
+            seconds=0.5 * rate * tick,
+            backlog=workers * slots + waiting,
+        )
+        for name, (workers, slots, rate, waiting) in {"A": a, "B": b}.items()
+    }
+
+
+def test_tasks_in_the_slots_of_a_worker_do_not_wait():
+    policy = BalancePolicy()
+    for tick in range(40):
+        assert policy.update(samples_at(tick, (2, 4, 8, 0), (8, 1, 8, 4)), 0.5) == []
+    a, b = policy.demands["A"], policy.demands["B"]
+    assert (a.rate, a.task_s, a.slots) == pytest.approx((16, 0.5, 8))
+    assert (a.wait_s, b.wait_s) == pytest.approx((0, 4 / 16))
+    # A tenth of the waiting time that causes the maximum surplus.
+    assert b.slots == pytest.approx(8 * (1 + 0.1 * 0.25), rel=0.01)
+
+
+def test_before_a_task_has_finished_the_demand_is_limited_by_the_slots():
+    policy = BalancePolicy()
+    samples = {"A": LoadSample(2, slots=4, backlog=100), "B": LoadSample(0, slots=3, backlog=100)}
+    policy.update(samples, 0.5)
+    assert [policy.demands[name].slots for name in "AB"] == pytest.approx([10, 3.75])
+    policy.update({"A": LoadSample(2, slots=4, backlog=7), "B": LoadSample(1)}, 0.5)
+    assert [policy.demands[name].slots for name in "AB"] == [7, 0]
+
+
+def test_a_worker_moves_to_where_slots_are_missing_not_workers():
+    policy = BalancePolicy()
+    for tick in range(60):  # A has 3 workers of 4 slots for 8 tasks, and B 6 slots for 8 tasks
+        shifts = policy.update(samples_at(tick, (3, 4, 8, 0), (6, 1, 8, 9)), 0.5)
+    assert shifts == [WorkerShift("A", "B", 1)]
+
+
+def test_the_time_for_which_averages_extend():
+    """After 6 running times, the former rate still counts by 1/e."""
+    policy = BalancePolicy()
+    finished = 0
+    for tick in range(200):
+        finished += 5 if tick < 160 else 10
+        policy.update({"A": LoadSample(5, finished=finished, seconds=1.0 * finished)}, 0.5)
+        if tick == 171:  # 6 s later, with tasks of 1 s
+            assert policy.demands["A"].rate == pytest.approx(20 - 10 / math.e, rel=0.02)
+    assert policy.demands["A"].rate == pytest.approx(20, rel=0.05)
+
+
 def test_three_partitions_exchange_workers_directly():
     policy = BalancePolicy()
     samples = {"A": LoadSample(4, backlog=0), "B": LoadSample(4), "C": LoadSample(4, backlog=50)}

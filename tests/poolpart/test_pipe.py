@@ -472,6 +472,12 @@ USES = {
 }
 
 
+@pytest.fixture(autouse=True)
+def _only_notifications(monkeypatch):
+    """Have waits end by notifications, rather than when they look again after a second."""
+    monkeypatch.setattr("poolpart.internals.queues.CHECK_S", 30.0)
+
+
 @pytest.mark.parametrize("others", [True, False])
 def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe, others):
     """Without others, the scheduler answers requests of pipes no more."""
@@ -893,8 +899,9 @@ def test_what_cannot_follow_from_the_state_is_refused(client, other, make_pipe, 
 
 @pytest.mark.parametrize("kind", [Queue, Variable])
 def test_who_deletes_the_queue_or_the_variable_deletes_the_pipe(
-    client, other, make_pipe, pool, kind
+    client, other, make_pipe, pool, kind, monkeypatch
 ):
+    monkeypatch.setattr("poolpart.internals.queues.CHECK_S", 0.05)  # Dask notifies nobody
     pipe = make_pipe(client)
     queue = Queue(pipe.name, other)
     waiting = [pool.submit(other_end(pipe).get), pool.submit(queue.get)]
