@@ -591,6 +591,49 @@ faults: [{kind: dirt, transmission: 0.3}]
     assert face.sum() > 10 and np.allclose(y[face], 6, atol=0.002)
 
 
+def test_materials_of_a_sensor_file_come_before_those_of_the_scenario(folder):
+    (folder / "scan.yaml").write_text("""
+scene: {files: [room.sdf]}
+actors: [{name: van, box: [4, 2, 2], at: [10, 8, 0]}, {name: bus, box: [9, 2, 3], at: [0, -8, 0]}]
+sensor: velodyne/vlp16
+poses: [[0, 0, 1]]
+materials: [{objects: van, reflectance: 0.8}, {objects: "*", reflectance: 0.2}]
+""")
+    own = "materials: [{objects: bus, reflectance: 0.4}]\n"
+    energies = {}
+    for materials in ("", own):
+        text = "sensors: {roof: {model: velodyne/vlp16, mount: [0, 0, 1]}}\n"
+        (folder / "sensors.yaml").write_text(text + materials)
+        loop = Loop("scan.yaml")
+        loop.play(lambda _: [("crate", "map", (3, 0, 0.5), 0.0)], 0, 0.3)
+        cloud = loop.clouds()[0]
+        x, y, _z = cloud.points.T
+        intensity = cloud.column("intensity").astype(float)
+        van = (np.abs(y - 7) < 0.01) & (x > 8)
+        bus = (np.abs(y + 7) < 0.01) & (np.abs(x) < 4)
+        crate = (np.abs(x - 2.5) < 0.01) & (np.abs(y) < 0.9)
+        assert min(van.sum(), bus.sum(), crate.sum()) > 20
+        energies[materials] = [intensity[part].sum() for part in (van, bus, crate)]
+    ratios = np.divide(energies[own], energies[""])
+    assert np.allclose(ratios, [1, 2, 1], rtol=0.01)
+
+
+def test_organized_clouds_have_one_point_per_ray(folder):
+    clouds = []
+    for organized in (True, False):
+        loop = Loop("room.sdf", organized=organized)
+        loop.play(lambda _: STILL, 20, 20.3)
+        clouds.append(loop.clouds()[1])
+    organized, compact = clouds
+    assert (organized.content.width, organized.content.is_dense) == (16, False)
+    assert organized.content.height in (1808, 1809) and compact.content.height == 1
+    returned = ~np.isnan(organized.points[:, 0])
+    assert len(returned) == 16 * organized.content.height
+    assert 10_000 < returned.sum() == len(compact.points)
+    assert {*map(bytes, organized.points[returned])} == {*map(bytes, compact.points)}
+    assert organized.stamp_s == compact.stamp_s
+
+
 def test_planar_and_livox_sensors_have_their_messages(folder):
     (folder / "sensors.yaml").write_text("""
 sensors:
