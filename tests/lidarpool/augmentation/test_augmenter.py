@@ -284,7 +284,10 @@ def test_a_stationary_car_keeps_its_place_while_the_sensor_moves(scene, sensor):
     np.testing.assert_allclose(centers, [12, 10, 8], atol=1e-3)
 
 
-def test_cars_move_during_a_sweep(clear, sensor):
+@pytest.mark.parametrize("is_stamped", [True, False])
+def test_cars_move_during_a_sweep(clear, sensor, is_stamped):
+    """Sweeps without timestamps last as long as a revolution of the sensor."""
+    clear = clear if is_stamped else replace(clear, read_stamps=None)
     speed = 20.0
     track = Track([0.0, 1.0], [[10, -3, -HEIGHT_M], [10 + speed, -3, -HEIGHT_M]], yaw_deg=0.0)
     augmenter = Augmenter(clear, Effects(actors=(Actor(CAR, track),)), sensor)
@@ -312,6 +315,30 @@ def test_added_points_have_the_times_of_their_firings(clear, sensor):
     assert added.sum() > 5000
     assert np.quantile(np.abs(late), 0.99) < 1 / 512
     assert abs(np.median(late)) < 0.3 / 512
+
+
+@pytest.mark.parametrize("marker", [0.0, np.nan])
+def test_pulses_without_a_return_are_no_points(clear, sensor, marker):
+    """Organized sweeps contain them, in other rows than the returns."""
+
+    def read(number):
+        sweep = clear.read(number)
+        rows = np.arange(len(sweep)).repeat(1 + (np.arange(len(sweep)) % 5 == 0))
+        is_lost = np.append(False, np.diff(rows) == 0)
+        organized = sweep.select(rows)
+        points = organized.points.copy()
+        points[is_lost] = marker
+        return organized.replace(points=points)
+
+    organized = replace(clear, read=read)
+    effects = Effects(weather=Weather(snow_mm_h=3.0))
+    expected = Augmenter(clear, effects, sensor).sweep(0)
+    result = Augmenter(organized, effects, sensor).sweep(0)
+    returned = result.sweep.has_return
+    np.testing.assert_allclose(result.sweep.points[returned], expected.sweep.points)
+    np.testing.assert_array_equal(result.is_recorded[returned], expected.is_recorded)
+    recorded_rows = np.flatnonzero(read(0).has_return)
+    np.testing.assert_array_equal(result.template[returned], recorded_rows[expected.template])
 
 
 def test_constant_times_are_kept(clear, sensor):

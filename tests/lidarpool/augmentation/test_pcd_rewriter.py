@@ -199,10 +199,12 @@ def test_organized_clouds(tmp_path, marker, kind):
     assert (tmp_path / "new.pcd").read_bytes().startswith(header(kind, count))
 
 
-def test_ranges_keep_the_unit_of_the_file():
+@pytest.mark.parametrize("unknown", [0, 30])  # of 40 ranges, most of which are 0 then
+def test_ranges_keep_the_unit_of_the_file(unknown):
     rows = rows_of()
     points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
     rows["range"] = np.rint(1000 * np.linalg.norm(points, axis=1))
+    rows["range"][:unknown] = 0
     sweep = Sweep(points, {"range": rows["range"]})
     moved = identity([sweep], 0)
     ranges_m = np.linalg.norm(points, axis=1) / 2  # of the simulation
