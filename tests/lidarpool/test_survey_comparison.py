@@ -28,7 +28,7 @@ from lidarpool import (
     open_recording,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.comparing.surveys import pairs
+from lidarpool.comparing.surveys import pairs, planes
 from lidarpool.comparing.surveys.survey_charts import draw_facades
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -424,8 +424,11 @@ def test_distances_are_positive_toward_the_poses_of_sweeps(moved):
     assert np.allclose(found.components["distance"], expected, atol=1e-6)
 
 
-def test_points_without_a_counterpart_are_counted():
+@pytest.mark.parametrize("batch", [70, 1000])
+def test_points_without_a_counterpart_are_counted(monkeypatch, batch):
+    monkeypatch.setattr(planes, "_BATCH", batch)
     far = np.concatenate([plane(500), plane(100) + np.array([0, 0, 5])])
+    far = far[np.random.default_rng(22).permutation(600)]
     found = compare_surveys(cloud(far), cloud(plane()), method="planes", max_distance_m=2)
     assert found.figures["without_counterpart"] == 100
     assert components(found, "distance")["count"] + found.figures["without_plane"] == 500
@@ -499,6 +502,37 @@ def test_strips_have_the_height_difference_between_them():
     assert overlap["count"] == 50 and overlap["area_m2"] == 200
     for name in ("mean_m", "median_m", "rmse_m", "p95_abs_m"):
         assert overlap[name] == pytest.approx(0.07, abs=1e-6)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_heights_of_strips_that_are_tilted_against_each_other_are_compared_in_between(order):
+    # In each cell of 2 m, the points of the strips are on opposite sides, and off center.
+    rng = np.random.default_rng(31)
+    ranges = [((0.1, 0.2), (1.5, 1.6)), ((0.55, 0.5), (1.9, 1.7))]
+    slopes = np.array([[0.05, -0.03], [-0.04, 0.08]])
+    cells = np.stack(np.meshgrid(np.arange(7), np.arange(4)), axis=-1).reshape(-1, 2)
+    strips, means = [], []
+    for (low, high), slope, height in zip(ranges, slopes, (0.0, 0.3), strict=True):
+        within = rng.uniform(low, high, (len(cells), 150, 2))
+        positions = 2 * cells[:, None] + within
+        means.append(positions.mean(axis=1))
+        strips.append(np.dstack([positions, height + positions @ slope]).reshape(-1, 3))
+    middle = (means[0] + means[1]) / 2
+    expected = middle @ (slopes[0] - slopes[1]) - 0.3
+    origin = ORIGIN - (0, 0, 7)
+    clouds = [cloud(strips[number] + origin) for number in order]
+    found = compare_strips(*clouds, cell_m=2.0)
+    assert np.ptp(expected) > 1.5
+    key = {tuple(center): value for center, value in zip(cells * 2 + 1, expected, strict=True)}
+    local = np.round(found.points[:, :2] - origin[:2]).astype(int)
+    sign = 1 if order == (0, 1) else -1
+    assert len(local) == len(cells)
+    for center, difference in zip(local, found.components["delta_h"], strict=True):
+        assert difference == pytest.approx(sign * key[tuple(center)], abs=1e-6)
+    (overlap,) = found.figures["overlaps"]
+    assert (overlap["a"], overlap["b"]) == ("cloud 1", "cloud 2")
+    assert overlap["min_m"] == pytest.approx(min(sign * expected), abs=1e-6)
+    assert overlap["area_m2"] == 4 * len(cells)
 
 
 def test_strips_of_a_file_are_its_point_sources_and_rough_cells_are_omitted(tmp_path):

@@ -333,7 +333,7 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
     if overlap is not None and overlap < plan.layout.overlap - 0.02:
         remedy = "" if plan.layout.follow else ", or follow the terrain with `--follow`"
         yield (
-            f"Over the highest ground, the overlap is {overlap:.0%} instead of "
+            f"Over the highest ground, the overlap is {round(overlap, 2) + 0.0:.0%} instead of "
             f"{plan.layout.overlap:.0%}. Increase `--overlap`{remedy}"
         )
     ratio = plan.along_m / plan.across_m
