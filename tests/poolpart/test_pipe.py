@@ -479,8 +479,11 @@ def _only_notifications(monkeypatch):
 
 
 @pytest.mark.parametrize("others", [True, False])
-def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe, others):
+def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(
+    client, make_pipe, monkeypatch, others
+):
     """Without others, the scheduler answers requests of pipes no more."""
+    monkeypatch.setattr("poolpart.pipe.WAIT_S", 5.0)
     if others:
         make_pipe(client)
     before = known(client)
@@ -488,12 +491,14 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
     pipe.put(1)
     pipe.delete()
     pipe.delete()
+    began_at = time.monotonic()
     for use in USES.values():
         for end in (pipe, other_end(pipe)):
             with pytest.raises(
                 PipeFailed, match=r"does not exist\. It was deleted or never created"
             ):
                 use(end)
+    assert time.monotonic() - began_at < 15  # no request has waited
     assert known(client) == before
 
 
