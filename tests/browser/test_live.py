@@ -117,12 +117,12 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
         run.most = first + 1
         tab.wait_for(lambda text: points_in(text) > first)
         tab.wait_for(lambda text: re.search(r"GPU, slots busy\s+\d+ % of 1", text))
-        assert not run.points.complete
+        assert not run.points.is_complete
     finally:
         run.most = ALL
         run.ended()
     assert run.error is None
-    assert run.points.complete
+    assert run.points.is_complete
     total = f"{run.points.parts.point_count:,} points"
     tab.wait_for(lambda text: "done" in text and total in text)
     rays = "[lidarpool.chosen.rays, lidarpool.picture.rays?.visible ?? false]"
@@ -148,7 +148,7 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         live.stopped.set()
         run.ended()
     assert isinstance(run.error, KeyboardInterrupt)
-    assert not run.points.complete
+    assert not run.points.is_complete
 
 
 def colors(picture):

@@ -199,6 +199,17 @@ def test_a_still_world_is_that_of_a_scanner_bit_for_bit(folder):
         assert cloud.clock_s - (20 + end_s) < 0.1  # at most one sweep late
 
 
+def test_a_simulation_in_which_all_is_right_has_no_notes(folder):
+    """Also after the time for which missing poses are tolerated at the start."""
+
+    def frames(time_s):
+        return [*STILL[:1], ("crate", "room", (3 + (time_s - 10), 0, 0.5), 0.0)]
+
+    loop = Loop("room.sdf")
+    loop.play(frames, 10, 12.5)
+    assert loop.notes == [] and len(loop.clouds()) >= 24
+
+
 def test_points_are_on_a_moving_body_where_it_is_when_they_are_measured(folder):
     def frames(time_s):
         return [*STILL[:1], ("crate", "room", (3 + 2 * (time_s - 10), 0, 0.5), 0.0)]
