@@ -27,6 +27,7 @@ from tests.simulated_drives import simulated_drive
 
 from lidarpool import Actor, Mounted, Pose, Scene, Survey, Track, load_sensor, twin
 from lidarpool.recordings.opening import open_recording
+from lidarpool.work.work import FOLDER
 from lidarscenes.procedural.cars import MODELS, car
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -135,19 +136,19 @@ def write_drive(folder: Path, sweeps: Sequence[Sweep], period_count: int) -> Pat
 
 def reconstruct(folder: Path) -> dict[str, Any]:
     """Reconstruct a drive in this process and its workers, and return the cost."""
-    steps = folder / "steps"
+    out = folder / "twin"
     largest = [0]
     ended = threading.Event()
 
     def watch() -> None:
         while not ended.wait(1.0):
-            sizes = [file.stat().st_size for file in steps.glob("**/*") if file.is_file()]
+            sizes = [file.stat().st_size for file in out.glob(f"{FOLDER}/**/*") if file.is_file()]
             largest[0] = max(largest[0], sum(sizes))
 
     watching = threading.Thread(target=watch)
     watching.start()
     try:
-        built = twin(folder / "drive", trajectory=folder / "poses.txt", folder=steps)
+        built = twin(folder / "drive", trajectory=folder / "poses.txt", out=out)
     finally:
         ended.set()
         watching.join()

@@ -332,7 +332,7 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.mounted_sensors[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
-    assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(
+    assert "scenario.yaml already exists. Use another output with `--out`, or pass" in str(
         result.exception
     )
 

@@ -20,7 +20,6 @@ import poolpart.deploy
 from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
 from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.finished_steps import STEPS_FOLDER
 from lidarpool.reconstruction.motion import Motion, MotionStep
 from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
 
@@ -130,11 +129,12 @@ def test_the_same_place_by_any_number_of_workers_and_after_a_kill(bag, tmp_path)
     other = runner.invoke(
         cli, ["twin", str(bag), "--out", str(folder), "--voxel-m", "0.2", "--resume"]
     )
-    assert "an unfinished reconstruction of another recording, or one with other options" in str(
-        other.exception
-    )
-    with pytest.raises(LidarError, match="an unfinished reconstruction of another recording"):
-        twin(bag, intensity="ring", folder=folder / STEPS_FOLDER, resume=True)
+    different = "an unfinished reconstruction with different inputs "
+    assert f"{different}(options)" in str(other.exception)
+    with pytest.raises(LidarError, match=rf"{different}\(part of the recording\)"):
+        twin(bag, intensity="ring", out=folder, resume=True)
+    with pytest.raises(LidarError, match=rf"{different}\(model\)"):
+        twin(bag, model="velodyne/vlp16", out=folder, resume=True)
     start = time.perf_counter()
     resumed = runner.invoke(cli, ["twin", str(bag), "--out", str(folder), "--resume"])
     resumed_s = time.perf_counter() - start

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.errors import LidarError
-
 from . import completion
 from . import shared_options as options
 from .shared_options import overwrite
@@ -60,6 +58,7 @@ if TYPE_CHECKING:
 )
 @options.scheduler
 @options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
+@options.flag("--restart", help="Discard an unfinished reconstruction and start again.")
 @overwrite
 @options.as_json
 def twin(
@@ -69,7 +68,7 @@ def twin(
     scheduler: str | None,
     files: TlsFiles,
     resume: bool,
-    overwrite: bool,
+    restart: bool,
     as_json: bool,
     **settings: Any,
 ) -> None:
@@ -88,36 +87,30 @@ def twin(
       lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - Click requires the character \b
-    from ..clouds.folder import result_folder
     from ..processes.fork_server import keep_freed_memory
     from ..reconstruction.building import twin as build
-    from ..reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps
     from ..reconstruction.twin import SCENARIO_FILE
     from ..run.cluster.connection import connect_client
 
-    if resume and overwrite:
-        raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
+    if resume and restart:
+        raise click.UsageError("`--resume` and `--restart` cannot be combined.")
     keep_freed_memory()
 
     def report(line: str) -> None:
         if not as_json:
             click.echo(f"{line} …", err=True)
 
-    with result_folder(out):
-        if (out / SCENARIO_FILE).exists() and not overwrite:
-            raise LidarError(
-                f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass "
-                "`--overwrite`."
-            )
-        steps = out / STEPS_FOLDER
-        if overwrite:
-            FinishedSteps(steps).remove()
-        with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
-            built = build(
-                recording, client=client, folder=steps, resume=resume, report=report, **settings
-            )
-        written = built.write(out)
-    paths = [click.format_filename(path) for path in written]
+    with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
+        built = build(
+            recording,
+            client=client,
+            out=out,
+            resume=resume,
+            restart=restart,
+            report=report,
+            **settings,
+        )
+    paths = [click.format_filename(out / name) for name in built.file_names]
     scenario = shlex.quote(str(out / SCENARIO_FILE))
     following = f"next: lidarpool run {scenario} [--sensor MODEL]"
     options.print_results(built.figures, [repr(built), *paths, following], as_json)

@@ -6,7 +6,6 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
@@ -25,18 +24,17 @@ from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.words import plural
 
-from ..clouds.folder import result_folder
+from ..clouds.folder import check_not_existing, result_folder
 from ..clouds.kitti import CALIBRATION_FILE
 from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.lidar4d import WINDOWS
 from ..recordings.opening import as_recording
-from ..work.lost_workers import LostWorkersError
 from ..work.mapping import MapFunction, parallel_map
+from ..work.work import Inputs, Step, Work
 from .air_returns import AirStatistics
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .chart_data import STATIONARY_DOTS, SweepImages, TopViewPoints
-from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
 from .isolated_returns import IsolatedRanges
 from .labels import split_by_object
@@ -46,6 +44,7 @@ from .moving_rays import MovingRays, SweepMasks
 from .odometry import RecordedPoses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
+from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, actors_of
 from .recorded_sensor import FittedSensor, SweepTiming, fit_sensor
 from .recorded_sweeps import RecordedSweeps
@@ -63,7 +62,7 @@ from .submap_tasks import (
 from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
-from .twin import NO_RETURN, Twin
+from .twin import NO_RETURN, SCENARIO_FILE, Twin
 from .vehicle_detection import find_poses_and_vehicle
 from .vehicle_returns import VehicleReturns
 from .visibility import estimate_visibility
@@ -77,10 +76,10 @@ _SUBMAP_BYTES = 3 << 30  # memory per process for a submap of a sensor with 64 r
 DEFAULT_VOXEL_M = 0.1
 _COMPARED_SWEEPS = 12  # held-out sweeps that are compared
 _RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
-_POSES = TwinStep("poses", (RecordedPoses, VehicleReturns, IsolatedRanges))
-_ALIGN = TwinStep("align", (AlignedSubmap,))
-_MOTION = TwinStep("motion", (SweepMasks, SweepMasks, SweepMasks, MovingRays, MovingRays))
-_BUILD = TwinStep(
+_POSES = Step("poses", (RecordedPoses, VehicleReturns, IsolatedRanges))
+_ALIGN = Step("align", (AlignedSubmap,))
+_MOTION = Step("motion", (SweepMasks, SweepMasks, SweepMasks, MovingRays, MovingRays))
+_BUILD = Step(
     "build",
     (
         SubmapSurfels,
@@ -106,8 +105,10 @@ def twin(
     lidar4d_window: int | None = None,
     actors: ActorSource | None = None,
     client: Client | None = None,
-    folder: str | Path | None = None,
+    out: str | Path | None = None,
     resume: bool = False,
+    restart: bool = False,
+    overwrite: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> Twin:
     """Reconstruct the static scene of a recording, so that the scene can be scanned again.
@@ -148,11 +149,15 @@ def twin(
         Client of a cluster whose OTHER workers can read the recording at the same path. By default,
         processes on this machine reconstruct the submaps. A recording in memory is always processed
         by this process.
-    folder
-        Folder for the results of finished steps, which is removed at the end. By default, a
-        temporary folder is used.
+    out
+        Folder to which the reconstruction is written, as by `Twin.save`. The results of finished
+        steps are kept in it until it is complete. By default, nothing is written.
     resume
-        Whether to continue with the finished steps in the folder.
+        Whether to continue an unfinished reconstruction in the folder.
+    restart
+        Whether to remove an unfinished reconstruction in the folder.
+    overwrite
+        Whether to replace a finished reconstruction in the folder.
     report
         Function that is called with a line for each step.
 
@@ -172,8 +177,9 @@ def twin(
     check_number("voxel_m", voxel_m, gt=0, le=10)
     if lidar4d_window is not None:
         check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
-    _check_folder(folder, resume=resume)
-    base = None if model is None else read_model(model)  # before the recording, which takes long
+    # Before the recording is read, which takes long.
+    _check_output(out, resume=resume, restart=restart, overwrite=overwrite)
+    base = None if model is None else read_model(model)
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.open(Path(recording), sensor, intensity, lidar4d_window)
     else:
@@ -192,29 +198,33 @@ def twin(
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
-    made_of = (_fingerprint_inputs(recorded, track), voxel_m, source)
+    inputs = _inputs(recorded, track, {"model": base, "options": (voxel_m, source)})
     with ExitStack() as stack:
-        if folder is None:
-            steps_folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
+        if out is None:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
         else:
-            steps_folder = stack.enter_context(result_folder(Path(folder)))
-        steps = FinishedSteps.create_or_resume(steps_folder, made_of, resume=resume)
-        try:
-            built = _Building(recorded, base, voxel_m, source, steps, client, report).twin(track)
-        except (KeyboardInterrupt, LostWorkersError) as error:
-            if folder is not None:
-                error.add_note(
-                    f"The finished steps are stored in {folder}. Continue with `--resume`."
-                )
-            raise
-        steps.remove()
+            folder = stack.enter_context(result_folder(Path(out)))
+        work = stack.enter_context(
+            Work.open(folder, inputs, noun="reconstruction", resume=resume, restart=restart)
+        )
+        built = _Building(recorded, base, voxel_m, source, work, client, report).twin(track)
+        if out is not None:
+            with work.publishing(SCENARIO_FILE, [ACTORS_FOLDER]) as staged:
+                built.write(staged)
     return built
 
 
-def _check_folder(folder: str | Path | None, *, resume: bool) -> None:
-    """Raise LidarError if a reconstruction is to be continued without a folder."""
-    if resume and folder is None:
-        raise LidarError("`resume` requires `folder`, which contains the finished steps.")
+def _check_output(out: str | Path | None, *, resume: bool, restart: bool, overwrite: bool) -> None:
+    """Raise LidarError if options contradict each other, or if the result exists."""
+    if resume and restart:
+        raise LidarError("`resume` and `restart` cannot be combined.")
+    if out is None:
+        if resume or restart or overwrite:
+            name = "resume" if resume else "restart" if restart else "overwrite"
+            raise LidarError(f"`{name}` requires `out`, the folder of the reconstruction.")
+        return
+    replaces = overwrite or (resume and Work.is_unfinished(Path(out)))
+    check_not_existing([Path(out) / SCENARIO_FILE], overwrite=replaces)
 
 
 def _check_sweeps(recorded: RecordedSweeps) -> None:
@@ -247,24 +257,23 @@ def _actor_source(recorded: RecordedSweeps, chosen: ActorSource | None) -> Actor
     return "clusters"
 
 
-def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
-    """Return the data that determines a twin, including names, sizes and change times of files.
+def _inputs(
+    recorded: RecordedSweeps, trajectory: Path | None, values: Mapping[str, object]
+) -> Inputs:
+    """Return what a twin depends on.
 
-    A recording in memory has no such identity, so it never matches a previous one.
+    A recording in memory has no identity, so it never matches an earlier one.
     """
     source = recorded.source
     if isinstance(source, Recording):
-        return [secrets.token_hex()]
-    files = [source[0]]
+        return Inputs({}, {"recording": secrets.token_hex(), **values})
+    files = {"recording": source[0]}
     if trajectory is not None:
-        files += [trajectory, trajectory.with_name(CALIBRATION_FILE)]
-    inner = chain.from_iterable(sorted(file.rglob("*")) for file in files if file.is_dir())
-    stated = [
-        (str(file), status.st_size, status.st_mtime_ns)
-        for file in chain(files, inner)
-        if file.is_file() and (status := file.stat())
-    ]
-    return [source, str(trajectory), *stated]
+        files |= {
+            "trajectory": trajectory,
+            "calibration": trajectory.with_name(CALIBRATION_FILE),
+        }
+    return Inputs(files, {"part of the recording": source, **values})
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +284,7 @@ class _Building:
     base: SensorModel | None
     voxel_m: float
     actors: ActorSource
-    steps: FinishedSteps
+    work: Work
     client: Client | None
     report: Callable[[str], None]
 
@@ -324,7 +333,7 @@ class _Building:
             poses, recorded = find_poses_and_vehicle(self.recorded, trajectory)
             return poses, recorded.vehicle, recorded.isolated
 
-        poses, vehicle, isolated = self.steps.run_once(_POSES, find)
+        poses, vehicle, isolated = self.work.once(_POSES, find)
         poses = poses._replace(
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
@@ -339,7 +348,7 @@ class _Building:
         tasks = [
             SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
         ]
-        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
+        aligned = [one for (one,) in self.work.each(_ALIGN, run, align_submap, tasks)]
         return merge_alignments(task.alignment, submaps, aligned)
 
     def _find_moving_objects(
@@ -354,7 +363,7 @@ class _Building:
         tasks = [replace(motion, submap=one) for one in submaps]
         parts = [
             (of_all, of_mapped)
-            for *_, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks)
+            for *_, of_all, of_mapped in self.work.each(_MOTION, run, find_moving_rays, tasks)
         ]
         of_all, of_mapped = (MovingRays.concatenate(part) for part in zip(*parts, strict=True))
         del parts  # to save memory
@@ -377,16 +386,16 @@ class _Building:
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
         fraction = STATIONARY_DOTS / max(count, 1.0)
-        tasks = _BuildTasks(replace(task, drawn_share=fraction), submaps, moving, self.steps)
+        tasks = _BuildTasks(replace(task, drawn_share=fraction), submaps, moving, self.work)
         parts = []
-        for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
+        for number, part in enumerate(self.work.each(_BUILD, run, build_submap, tasks), 1):
             self.report(f"built {number} of {plural(len(submaps), 'submap')}")
             surfels, _, *others = part
             parts.append(_BuiltSubmap(surfels, *others))
         return _Built(parts, submaps)
 
     def _load_observations(self, index: int) -> Observations:
-        observations: Observations = self.steps.load_record(_BUILD, index, 1)
+        observations: Observations = self.work.load(_BUILD, index, 1)
         return observations
 
     def _assemble(
@@ -670,7 +679,7 @@ class _BuildTasks(Sequence[BuildTask]):
     task: BuildTask
     submaps: Sequence[Submap]
     moving: MovingObjects | None
-    steps: FinishedSteps
+    work: Work
 
     def __len__(self) -> int:
         return len(self.submaps)
@@ -679,7 +688,7 @@ class _BuildTasks(Sequence[BuildTask]):
         submap = self.submaps[index]
         objects = None
         if self.moving is not None:
-            masks = (self.steps.load_record(_MOTION, index, number) for number in range(3))
+            masks = (self.work.load(_MOTION, index, number) for number in range(3))
             times_s = self.task.alignment.times_s[submap.numbers]
             objects = self.moving.between(float(times_s[0]), float(times_s[-1]), *masks)
         return replace(self.task, submap=submap, objects=objects)

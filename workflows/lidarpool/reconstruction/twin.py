@@ -24,6 +24,7 @@ from lidarview.page_templates import render_template
 from ..clouds.folder import result_folder, staging
 from ..comparing import lidar4d
 from ..scenario.point_scene import CLASS_MATERIAL
+from ..work.publishing import move_into_place
 from .labels import SurfelMaterial
 from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, class_names
@@ -105,7 +106,7 @@ class Twin:
         Returns
         -------
         list of Path
-            The written files.
+            The written files and folders.
 
         Raises
         ------
@@ -113,44 +114,46 @@ class Twin:
             If the folder cannot be written to.
         """
         path = Path(folder)
-        with result_folder(path):
-            return self.write(path)
-
-    def write(self, folder: Path) -> list[Path]:
-        """Write the files of `save` to a folder that the caller has locked."""
         with (
+            result_folder(path),
             explain_os_errors(
-                f"The reconstruction cannot be written to {folder}", "free some disk space"
+                f"The reconstruction cannot be written to {path}", "free some disk space"
             ),
-            staging(folder) as staged,
+            staging(path) as staged,
         ):
-            write_scene(staged / SCENE_FILE, self.scene)
+            self.write(staged)
+            move_into_place(staged, path, last=SCENARIO_FILE, remove=[ACTORS_FOLDER])
+        return [path / name for name in self.file_names]
+
+    @property
+    def file_names(self) -> list[str]:
+        """Names of the files and folders that `save` writes. The scenario is the last one."""
+        names = [SCENE_FILE, TRAJECTORY_FILE, SENSOR_FILE, FIGURES_FILE, PAGE_FILE]
+        return [*names, *([ACTORS_FOLDER] if self.actors else []), SCENARIO_FILE]
+
+    def write(self, staged: Path) -> None:
+        """Write the files of `save` to an empty folder."""
+        write_scene(staged / SCENE_FILE, self.scene)
+        if self.actors:
             (staged / ACTORS_FOLDER).mkdir()
-            actor_files = [
-                f"{ACTORS_FOLDER}/{name}"
-                for actor in self.actors
-                for name in actor.write(staged / ACTORS_FOLDER)
-            ]
-            pictures = {name: page.svg() for name, page in self.pictures.items()}
-            page = render_template(
-                "twin.html", __name__, lidar4d.__name__, report=self.figures, pictures=pictures
-            )
-            stated = self.model.model_dump(mode="json", exclude_defaults=True)
-            stated |= self.model.model_dump(mode="json", include=_ROTATION_FIELDS)
-            model = {name: stated[name] for name in SensorModel.model_fields if name in stated}
-            texts = {
-                TRAJECTORY_FILE: self._trajectory(),
-                SENSOR_FILE: yaml.safe_dump(model, sort_keys=False, default_flow_style=None),
-                SCENARIO_FILE: self._scenario(),
-                FIGURES_FILE: json.dumps(self.figures, indent=1, allow_nan=False) + "\n",
-                PAGE_FILE: page,
-            }
-            for name, text in texts.items():
-                (staged / name).write_text(text, encoding="utf-8", newline="\n")
-            if self.actors:
-                (folder / ACTORS_FOLDER).mkdir(exist_ok=True)
-            names = (SCENE_FILE, *actor_files, *texts)
-            return [(staged / name).replace(folder / name) for name in names]
+        for actor in self.actors:
+            actor.write(staged / ACTORS_FOLDER)
+        pictures = {name: page.svg() for name, page in self.pictures.items()}
+        page = render_template(
+            "twin.html", __name__, lidar4d.__name__, report=self.figures, pictures=pictures
+        )
+        stated = self.model.model_dump(mode="json", exclude_defaults=True)
+        stated |= self.model.model_dump(mode="json", include=_ROTATION_FIELDS)
+        model = {name: stated[name] for name in SensorModel.model_fields if name in stated}
+        texts = {
+            TRAJECTORY_FILE: self._trajectory(),
+            SENSOR_FILE: yaml.safe_dump(model, sort_keys=False, default_flow_style=None),
+            SCENARIO_FILE: self._scenario(),
+            FIGURES_FILE: json.dumps(self.figures, indent=1, allow_nan=False) + "\n",
+            PAGE_FILE: page,
+        }
+        for name, text in texts.items():
+            (staged / name).write_text(text, encoding="utf-8", newline="\n")
 
     def _materials(self) -> list[SurfelMaterial]:
         """Return the materials of surfels that have a class or gaps, in ascending order."""
