@@ -305,6 +305,9 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     files = place.save(tmp_path / "twin")
     assert {file.name for file in files} == {
         "place.glb", "trajectory.csv", "sensor.yaml", "scenario.yaml", "twin.json", "report.html",
+        "actors",
+    }  # fmt: skip
+    assert {file.name for file in (tmp_path / "twin" / "actors").iterdir()} == {
         "car-1.glb", "car-1.csv",
     }  # fmt: skip
     path = tmp_path / "twin" / "scenario.yaml"

@@ -198,7 +198,8 @@ def twin(
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
-    inputs = _inputs(recorded, track, {"model": base, "options": (voxel_m, source)})
+    stated = None if base is None else base.model_dump(mode="json")
+    inputs = _inputs(recorded, track, {"model": stated, "options": (voxel_m, source)})
     with ExitStack() as stack:
         if out is None:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
