@@ -1,6 +1,7 @@
 """Tasks do not wait behind others while a slot is free, and end if they take too long."""
 
 import os
+import signal
 import time
 
 import pytest
@@ -66,6 +67,11 @@ def sleep_if_odd(number):
     return number
 
 
+def stop_worker():
+    """Make the worker unresponsive, as if the function held the interpreter lock."""
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
 def test_a_task_that_takes_too_long_fails(client, b, event):
     ended = event(client)
     future = b.submit(until_cancelled, ended.name, timeout_s=0.3)
@@ -105,6 +111,17 @@ def test_a_worker_that_does_not_return_is_restarted(nannies, monkeypatch):
     assert [type(result) for result in results] == [int, TaskTimeoutError, int, TaskTimeoutError]
     assert results[1].__notes__ == ["poolpart: The error occurred for item 1 of a map: 1"]
     assert both.submit(abs, -2).result(LONG_S) == 2
+
+
+@pytest.mark.extended
+def test_a_task_that_blocks_its_worker_fails_as_well(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
+    monkeypatch.setattr("poolpart.extras.watching.SILENT_S", 3.0)
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    with pytest.raises(TaskTimeoutError):
+        both.submit(stop_worker, timeout_s=0.5).result(LONG_S)
+    assert nannies.gather([both.submit(abs, -number) for number in range(9)]) == [*range(9)]
 
 
 def hang_on(name):

@@ -167,33 +167,45 @@ class TaskWatch:
             return
         if (worker, task.key) in self._ending or not slots_of(task, name):
             return
-        request = asyncio.ensure_future(self._end(name, worker, task, seconds, limit_s))
+        error = TaskTimeoutError(
+            f"Task {task.key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
+            f"{limit_s:g} s (`timeout_s`)."
+        )
+        ending = worker, task.key
+        self._ending.add(ending)
+        request = asyncio.ensure_future(self._end(name, worker, task, error))
         self._requests.add(request)
         request.add_done_callback(self._requests.discard)
+        request.add_done_callback(lambda _: self._ending.discard(ending))
 
-    async def _end(self, name: str, worker: Any, task: Any, seconds: float, limit_s: float) -> None:
+    async def _end(self, name: str, worker: Any, task: Any, error: TaskTimeoutError) -> None:
         """Let a task fail, and restart its worker if the function does not return."""
         key = task.key
         annotations = task.annotations
         candidates = {candidate.key for candidate in running_candidates(worker)}
-        self._ending.add((worker, key))
-        error = TaskTimeoutError(
-            f"Task {key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
-            f"{limit_s:g} s (`timeout_s`)."
-        )
-        stop_assigning(self.scheduler, worker)  # a further run starts elsewhere
+        was_running = worker in self.scheduler.running  # rather than paused
+        is_silent = time.time() - worker.last_seen > SILENT_S
+        if is_silent and len(worker.processing) > 1 and not task.suspicious:
+            # Another task may be running, if the report that this one has finished is delayed.
+            # Therefore, the task fails only if this happens again.
+            task.suspicious += 1
+            await free_worker(self.scheduler, worker, name, candidates, candidates)
+            return
+        if was_running:
+            stop_assigning(self.scheduler, worker)  # a further run starts elsewhere
         fail_task(self.scheduler, task, worker.address, error)
-        resume_assigning(self.scheduler, worker)
-        try:
-            if not await await_end(self.scheduler, worker, key, ANSWER_S):
-                outcome = await free_worker(
-                    self.scheduler, worker, name, {key}, candidates, patience_s=PATIENCE_S
-                )
-                logger.warning("%s Its function did not return: %s.", error, outcome)
-                if outcome.startswith("restarted"):
-                    fail_pipes_of_killed_task(self.scheduler, key, annotations)
-        finally:
-            self._ending.discard((worker, key))
+        if was_running and not is_silent:
+            resume_assigning(self.scheduler, worker)
+        has_ended = await await_end(self.scheduler, worker, key, ANSWER_S)
+        if was_running and is_silent:
+            resume_assigning(self.scheduler, worker)
+        if not has_ended:
+            outcome = await free_worker(
+                self.scheduler, worker, name, {key}, candidates, patience_s=PATIENCE_S
+            )
+            logger.warning("%s Its function did not return: %s.", error, outcome)
+            if outcome.startswith("restarted"):
+                fail_pipes_of_killed_task(self.scheduler, key, annotations)
 
 
 def slots_of(task: Any, name: str) -> float:
