@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -424,6 +425,21 @@ def test_several_files_of_different_formats_are_one_view(exported, monkeypatch):
     monkeypatch.setattr(bags, "_MAX_DISTANCE_NS", -1)
     with pytest.raises(LidarError, match=r"cloud.mcap contains points in sensor coordinates"):
         open_views([folder / "cloud.las", folder / "cloud.mcap"])
+
+
+def test_several_inputs_are_exported_to_one_page(tmp_path):
+    names = [f"{folder}/cloud.xyz" for folder in ("before", "after")]
+    for number, name in enumerate(names):
+        (tmp_path / name).parent.mkdir()
+        np.savetxt(tmp_path / name, np.arange(60.0).reshape(20, 3) + number)
+    files = [str(tmp_path / name) for name in names]
+    page = tmp_path / "both.html"
+    done = CliRunner().invoke(view_command, [*files, "--export", str(page)])
+    assert done.exit_code == 0, done.output
+    assert open_views([*map(Path, files)]).results == files
+    assert page.read_text() == render_page(open_views([*map(Path, files)])).decode()
+    done = CliRunner().invoke(view_command, [*files, "--film", str(tmp_path / "both.gif")])
+    assert "`--film` requires a single input" in str(done.exception)
 
 
 def test_a_robot_is_previewed_as_it_is_scanned(tmp_path):

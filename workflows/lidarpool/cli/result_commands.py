@@ -307,8 +307,8 @@ def view(
     from ..clouds.folder import local_result
     from ..pages.opened import growing_view, is_data_set, open_views
 
-    if (film or export) and len(results) > 1:
-        raise LidarError("`--film` and `--export` require a single input.")
+    if film and len(results) > 1:
+        raise LidarError("`--film` requires a single input.")
     if data_sets := [result for result in results if is_data_set(result)]:
         if len(results) > 1 or film or export:
             raise LidarError(
