@@ -157,6 +157,8 @@ class Fences(SchedulerPlugin):
         elapsed_s = time.monotonic() - self._warned_at
         if elapsed_s < WARN_EVERY_S or not self.keeps_out(task):
             return
+        if self.scheduler.valid_workers(task):  # it waits for a slot of another partition
+            return
         if not workers_without_fences(self.scheduler, task):  # it would wait without fences, too
             return
         self._warned_at = time.monotonic()

@@ -15,7 +15,9 @@ the task that has submitted it. Clients with the same name are the same client.
 
 A task that waits for a nested task only lends its slots if the nested task waits on the same
 worker (see `extras.lending`). Therefore, one nested task more than there are slots may be assigned
-to the worker of the task that has submitted it.
+to the worker of the task that has submitted it. The same applies to tasks that are bound to
+workers, because they could not use a slot of another worker in the meantime. These are called tied
+tasks in this module.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ _UUID_LETTERS = 36
 class _Bounds(NamedTuple):
     """What restricts the workers of a task, apart from its partition."""
 
-    is_nested: bool = False
+    is_tied: bool = False  # whether the task is nested or bound to workers
     workers: frozenset[str] | None = None
     hosts: frozenset[str] | None = None
 
@@ -83,7 +85,7 @@ class _Assignment:
     worker: Any
     slots: float
     seconds: float  # expected slot time
-    is_nested: bool
+    is_tied: bool
     is_lent: bool = False
 
 
@@ -92,7 +94,7 @@ class _Load:
     """Slots that the assigned tasks of a worker request."""
 
     used: float = 0.0
-    nested: float = 0.0  # slots that nested tasks request, which are included in `used`
+    tied: float = 0.0  # slots that tied tasks request, which are included in `used`
     seconds: float = 0.0  # expected slot time of the tasks
     free: float = 0.0  # number of slots without a task
 
@@ -111,7 +113,7 @@ class PartitionQueue:
     loads: dict[Any, _Load] = field(default_factory=dict)  # by worker
     # Workers that have room for a task, starting with the one that has had room the longest.
     with_room: dict[Any, None] = field(default_factory=dict)
-    nested_held: int = 0  # number of nested tasks among `held`
+    tied_held: int = 0  # number of tied tasks among `held`
     free_slots: float = 0.0  # number of slots without a task
     _idle_s: float = 0.0  # time until the last change for which slots had no task, times slots
     _changed_at: float = field(default_factory=time.monotonic)  # last change of `free_slots`
@@ -127,9 +129,9 @@ class PartitionQueue:
                 self.with_room.pop(worker, None)
                 return
             load = self.loads[worker] = _Load()
-        # One nested task may wait in addition. Otherwise, nested tasks would keep tasks of other
-        # clients off the worker.
-        used = load.used - min(load.nested, 1) if load.nested else load.used
+        # One tied task may wait in addition. Otherwise, tied tasks would keep tasks of others off
+        # the worker.
+        used = load.used - min(load.tied, 1) if load.tied else load.used
         had_room = worker in self.with_room
         if slots and has_room(slots, used, load.seconds, had_room):
             if not had_room:
@@ -190,8 +192,8 @@ class PartitionQueue:
             load = self.loads[assignment.worker] = _Load()
         load.used += sign * assignment.slots
         load.seconds += sign * assignment.seconds
-        if assignment.is_nested:
-            load.nested += sign * assignment.slots
+        if assignment.is_tied:
+            load.tied += sign * assignment.slots
         self.update_worker(assignment.worker)
 
     # -- held tasks --------------------------------------------------------------------
@@ -199,7 +201,7 @@ class PartitionQueue:
     def hold(self, task: Any, held: _HeldTask) -> None:
         """Add a task that waits for a slot."""
         self.held[task.key] = held
-        self.nested_held += held.bounds.is_nested
+        self.tied_held += held.bounds.is_tied
         heap = self.heaps.setdefault(held.client, {}).setdefault(held.bounds, [])
         self.pushed += 1
         heapq.heappush(heap, (task.priority, self.pushed, task.key))
@@ -209,7 +211,7 @@ class PartitionQueue:
         """Remove a task that no longer waits, and return its entry, if any."""
         held = self.held.pop(key, None)
         if held is not None:
-            self.nested_held -= held.bounds.is_nested
+            self.tied_held -= held.bounds.is_tied
         return held
 
     def heads(self, client: str) -> list[_HeldTask]:
@@ -434,7 +436,7 @@ class Shares(SchedulerPlugin):
             self._start(queue, task, client, worker)
             return worker
         queue.hold(task, _HeldTask(client, bounds, time.monotonic(), task))
-        if queue.with_room or bounds.is_nested:
+        if queue.with_room or bounds.is_tied:
             self._dispatch_soon()
         return None
 
@@ -461,9 +463,9 @@ class Shares(SchedulerPlugin):
             0.0 if held is None else now - held.since,
             [*passed_over],
         )
-        is_nested = submitter_of(task) is not None
+        is_tied = bool(task.worker_restrictions) or submitter_of(task) is not None
         seconds = slots * charge.expected_s
-        queue.assign(task.key, _Assignment(worker, slots, seconds, is_nested))
+        queue.assign(task.key, _Assignment(worker, slots, seconds, is_tied))
         self._assigned_in[task.key] = queue
         task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))
 
@@ -478,7 +480,7 @@ class Shares(SchedulerPlugin):
             worker = self._worker_with_room(queue, task, slots, allowed)
             if worker is not None:
                 return worker
-        return self._worker_for_nested(queue, task, slots, allowed) if bounds.is_nested else None
+        return self._worker_for_tied(queue, task, slots, allowed) if bounds.is_tied else None
 
     def _worker_with_room(
         self, queue: PartitionQueue, task: Any, slots: float, allowed: Any
@@ -508,10 +510,8 @@ class Shares(SchedulerPlugin):
             return candidates[0] if candidates else None
         return earliest_worker(self.scheduler, task, candidates)
 
-    def _worker_for_nested(
-        self, queue: PartitionQueue, task: Any, slots: float, allowed: Any
-    ) -> Any:
-        """Return a worker on which a nested task should wait, so that slots are lent to it."""
+    def _worker_for_tied(self, queue: PartitionQueue, task: Any, slots: float, allowed: Any) -> Any:
+        """Return a worker on which a nested or bound task should wait, or None."""
         submitter = submitter_of(task)
         home = self.scheduler.workers.get(submitter.worker) if submitter is not None else None
         loads = queue.loads
@@ -520,7 +520,7 @@ class Shares(SchedulerPlugin):
         else:
             candidates = loads if allowed is None else [w for w in allowed if w in loads]
         for worker in candidates:
-            if loads[worker].nested < worker.resources.get(queue.name, 0) + 1 and can_run(
+            if loads[worker].tied < worker.resources.get(queue.name, 0) + 1 and can_run(
                 self.scheduler, worker, queue.name, slots
             ):
                 return worker
@@ -538,12 +538,12 @@ class Shares(SchedulerPlugin):
         """Assign held tasks to workers with room, as long as there are both."""
         self._is_dispatch_due = False
         for queue in self.queues.values():
-            if queue.held and (queue.with_room or queue.nested_held):
+            if queue.held and (queue.with_room or queue.tied_held):
                 self._dispatch_from(queue)
 
     def _dispatch_from(self, queue: PartitionQueue) -> None:
         chosen: list[Any] = []
-        while queue.held and (queue.with_room or queue.nested_held):
+        while queue.held and (queue.with_room or queue.tied_held):
             found = self._next_task(queue)
             if found is None:
                 break
@@ -561,7 +561,7 @@ class Shares(SchedulerPlugin):
         passed_over: list[str] = []
         for client in queue.policy.clients_in_turn():
             for held in queue.heads(client):
-                if not (queue.with_room or held.bounds.is_nested):
+                if not (queue.with_room or held.bounds.is_tied):
                     continue
                 worker = self._worker_for(queue, held.task, held.bounds)
                 if worker is not None:
@@ -606,12 +606,12 @@ class Shares(SchedulerPlugin):
 
 
 def _bounds_of(task: Any) -> _Bounds:
-    is_nested = submitter_of(task) is not None
-    if not (is_nested or task.worker_restrictions or task.host_restrictions):
-        return _ANY_WORKER
     workers, hosts = task.worker_restrictions, task.host_restrictions
+    is_tied = bool(workers) or submitter_of(task) is not None
+    if not (is_tied or hosts):
+        return _ANY_WORKER
     return _Bounds(
-        is_nested,
+        is_tied,
         frozenset(workers) if workers else None,
         frozenset(hosts) if hosts else None,
     )

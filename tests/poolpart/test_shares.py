@@ -35,13 +35,14 @@ def pair(start):
 
 @pytest.fixture
 def gate(pair):
-    """Occupy the slot until the event is set."""
+    """Occupy the slot with a task of a third client until the event is set."""
     event = Event("gate", pair[0].client)
-    blocker = pair[0].submit(wait_for, "gate", key="blocker")
-    while pair[0].stats().running < 1:
-        time.sleep(0.01)
-    yield event
-    blocker.result(LONG_S)
+    with Client(pair[0].client.cluster, name="dora") as client:
+        blocker = Partition("P", client).submit(wait_for, "gate", key="blocker")
+        while pair[0].stats().running < 1:
+            time.sleep(0.01)
+        yield event
+        blocker.result(LONG_S)
 
 
 def await_queued(part, number):
@@ -187,7 +188,7 @@ def test_statistics_page_and_metrics_show_shares_and_waits(pair, gate):
     futures = [*by_submit(alice, "alice", 4), *by_submit(bob, "bob", 4)]
     await_queued(bob, 8)
     clients = alice.stats().clients
-    assert clients["alice"].slots == 1
+    assert clients["dora"].slots == 1
     assert (clients["alice"].waiting, clients["bob"].waiting) == (4, 4)
     assert "bob" in repr(alice.stats())
     gate.set()
@@ -239,6 +240,21 @@ def test_tasks_bound_to_a_worker_do_not_delay_others(start):
         assert not any(future.done() for future in bound)
         Event("gate", client).set()
         assert client.gather([*bound, blocker]) == [*range(9), True]
+
+
+def test_a_bound_task_waits_on_its_worker_and_leaves_room_for_others(pair, wait_until):
+    alice, bob = pair
+    scheduler = alice.client.cluster.scheduler
+    [worker] = scheduler.workers.values()
+    bound = [alice.submit(wait_for, f"gate {n}", workers="w") for n in range(4)]
+    wait_until(lambda: len(worker.processing) == 2)  # the next one is there when a slot is free
+    future = bob.submit(run, "bob")
+    for number in range(2):
+        Event(f"gate {number}", alice.client).set()
+    assert future.result(LONG_S) is None
+    for number in range(2, 4):
+        Event(f"gate {number}", alice.client).set()
+    wait(bound, timeout=LONG_S)
 
 
 @pytest.mark.extended
