@@ -212,6 +212,8 @@ class PartitionQueue:
         held = self.held.pop(key, None)
         if held is not None:
             self.tied_held -= held.bounds.is_tied
+            if not self.held:
+                self.heaps.clear()  # entries of canceled tasks would remain
         return held
 
     def heads(self, client: str) -> list[_HeldTask]:
@@ -601,7 +603,7 @@ class Shares(SchedulerPlugin):
                 queue.update_worker(worker)
             queue.policy.remove_idle(self._present, now)
             if queue.loads:  # otherwise, there are no workers
-                refresh_waiting_times(self.scheduler, [held.task for held in queue.held.values()])
+                refresh_waiting_times(self.scheduler, (h.task for h in queue.held.values()))
         self._dispatch_soon()
 
 
