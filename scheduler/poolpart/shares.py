@@ -393,6 +393,10 @@ class Shares(SchedulerPlugin):
             queue.update_worker(worker)
         self._dispatch_soon()
 
+    def add_worker(self, scheduler: Any, worker: str) -> None:
+        """Assign tasks to a worker that has joined."""
+        self._admit(scheduler.workers[worker])
+
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker that has left."""
         for queue in self.queues.values():
