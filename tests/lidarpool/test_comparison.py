@@ -16,7 +16,7 @@ import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.clouds.recording import RayTimes
 from lidarpool.clouds.writing import ExportSpec
-from lidarpool.comparing import comparison, two_clouds
+from lidarpool.comparing import comparison_charts, two_clouds
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.recordings.opening import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
@@ -362,7 +362,7 @@ def test_intensities_have_one_scale_only_if_both_are_energies(written):
     )
     energies = compare(weak, strong)
     assert energies.figures["intensity"]["same_scale"]
-    axes = comparison.draw_distances(energies).figure.axes[1]
+    axes = comparison_charts.draw_distances(energies).figure.axes[1]
     assert (axes.get_xlabel(), axes.get_ylabel()) == (
         "intensity in B, energy",
         "intensity in A, energy",
@@ -372,7 +372,7 @@ def test_intensities_have_one_scale_only_if_both_are_energies(written):
     assert compare(folder / "cloud.mcap", folder).figures["intensity"]["same_scale"]
     recorded = compare(folder / "cloud.laz", folder)
     assert not recorded.figures["intensity"]["same_scale"]
-    axes = comparison.draw_distances(recorded).figure.axes[1]
+    axes = comparison_charts.draw_distances(recorded).figure.axes[1]
     assert (axes.get_xlabel(), axes.get_ylabel()) == (
         "intensity in B, scale of B",
         "intensity in A, scale of A",
@@ -711,7 +711,7 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
 
 
 def test_range_images_are_yellow_where_it_is_near():
-    page = comparison.draw_ranges(compare(cloud(), cloud()))
+    page = comparison_charts.draw_ranges(compare(cloud(), cloud()))
     (image,) = page.figure.axes[0].images
     colors = np.asarray(image.get_array()).reshape(-1, 3)
     green = colors[:, 1]  # rises from violet to yellow
@@ -734,7 +734,7 @@ def test_channels_without_returns_in_one_cloud_are_named_and_drawn(dead_in, dead
     clouds = {"a": cloud(), "b": cloud(), dead_in: cloud(there=there)}
     found = compare(clouds["a"], clouds["b"])
     assert found.figures["notes"] == [f"cloud {dead_in.upper()} has no returns in {says}"]
-    gaps = comparison.draw_rings(found).figure.axes[1]
+    gaps = comparison_charts.draw_rings(found).figure.axes[1]
     drawn = {
         line.get_label(): dict(zip(np.round(line.get_ydata()), line.get_xdata(), strict=True))
         for line in gaps.lines
@@ -751,7 +751,7 @@ def test_maps_of_georeferenced_clouds_have_short_numbers():
     """The offset is in the titles of the axes, not above the chart, where the heading is."""
     corner = np.array([500_000, 5_400_000, 300])
     positions = corner + np.random.default_rng(6).uniform(0, 40, (50, 3))
-    page = comparison.draw_above(compare(Cloud(positions, {}), Cloud(positions, {})))
+    page = comparison_charts.draw_above(compare(Cloud(positions, {}), Cloud(positions, {})))
     page.figure.draw_without_rendering()
     for axes in page.figure.axes[:2]:
         for axis, title in ((axes.xaxis, axes.get_xlabel()), (axes.yaxis, axes.get_ylabel())):
@@ -765,7 +765,7 @@ def test_maps_of_georeferenced_clouds_have_short_numbers():
 
 def test_the_axis_of_small_distances_has_numbers_that_can_be_read():
     positions = np.random.default_rng(6).uniform(0, 9, (50, 3))
-    page = comparison.draw_distances(compare(Cloud(positions, {}), Cloud(positions, {})))
+    page = comparison_charts.draw_distances(compare(Cloud(positions, {}), Cloud(positions, {})))
     page.figure.draw_without_rendering()
     axis = page.figure.axes[0].xaxis
     texts = [text.get_text() for text in axis.get_ticklabels(which="both") if text.get_text()]

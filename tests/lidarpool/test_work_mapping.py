@@ -191,6 +191,8 @@ def test_a_map_on_this_machine_imports_no_dask():
         "augmentation.running",
         "reconstruction.building",
         "comparing.fit.fitting",
+        "comparing.surveys.comparing_surveys",
+        "comparing.two_clouds",
         "occupancy.writing",
         "mounting.study",
         "recordings.opening",

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarsim.errors import explain_os_errors
-from lidarview.render.picture_page import Page
 
 from ..clouds.folder import result_folder, staging
+
+if TYPE_CHECKING:
+    from lidarview.render.picture_page import Page
 
 # Pictures of all kinds of comparisons.
 _PICTURES = ("ranges", "rings", "distances", "above", "map", "facades", "histogram")

@@ -28,7 +28,8 @@ from ..datasets.figures import rank_correlation
 from ..open3d_access.neighbors import nearest_neighbors
 from ..recordings.opening import open_recording
 from .compared_sweep import bounds_of, compared_in_world, compared_sweep, origin_to_add, rings_note
-from .comparison import CELLS, RESIDUALS, Comparison
+from .comparison import Comparison
+from .comparison_data import CELLS, RESIDUALS
 from .lidar4d import PROTOCOL, FrameCollector
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 

@@ -18,7 +18,6 @@ from lidarview.page_templates import render_template
 from ...clouds.writing import save_cloud
 from ..comparison_files import write_comparison
 from .deviations import STATISTICS
-from .survey_charts import draw_facades, draw_histograms, draw_maps
 
 LABELS = {
     "delta_e": "ΔE",
@@ -91,6 +90,8 @@ class SurveyComparison:
         LidarError
             If the folder cannot be written to.
         """
+        from .survey_charts import draw_facades, draw_histograms, draw_maps  # imports Matplotlib
+
         pages = {
             "map": draw_maps(self.figures, self.points, self.components, LABELS),
             "histogram": draw_histograms(self.figures, self.components, LABELS),
