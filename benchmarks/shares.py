@@ -63,6 +63,7 @@ def second_client_s(client: Client, enabled: bool) -> float:
     """Return how long a second client waits for 10 tasks behind 400 tasks of the first one."""
     client.run_on_scheduler(set_shares, enabled=enabled)
     futures = client.map(time.sleep, [0.05] * 400, pure=False, resources={NAME: 1})
+    time.sleep(0.5)  # Dask gives graphs that arrive within 0.1 s the same rank
     with Client(client.scheduler.address) as other:
         started = time.perf_counter()
         wait([Partition(NAME, other).submit(time.sleep, 0.05) for _ in range(10)])
