@@ -112,6 +112,25 @@ def test_hills_narrow_the_spacing_and_slow_the_aircraft(scanner):
         assert line.clearance_m[1] == pytest.approx(500)
 
 
+@pytest.mark.parametrize(
+    ("overlap", "shown"), [(0.204, "20%"), (0.004, "0%"), (-0.004, "0%"), (-0.024, "-2%")]
+)
+def test_the_overlap_over_a_small_hill_is_noted(scanner, overlap, shown):
+    def hilly(height_m):
+        hill = level("Hill", height_m, 60, (700, 500))
+        return Terrain(Scene.from_meshes([level("Plain", half=8000), hill]))
+
+    flat = planned(scanner)
+    # The lines are level at their height above the mean ground, which rises with the hill.
+    share = (500 - planned(scanner, terrain=hilly(100)).lowest_m) / 100
+    lowest_m = flat.spacing_m / (1 - overlap) / (flat.swath_m / 500)
+    plan = planned(scanner, terrain=hilly((500 - lowest_m) / share))
+    assert plan.spacing_m == flat.spacing_m
+    assert plan.min_overlap == pytest.approx(overlap, abs=1e-4)
+    (note,) = [note for note in plan.notes if "overlap" in note]
+    assert f"the overlap is {shown} instead of 30%. Increase `--overlap`" in note
+
+
 def test_an_aircraft_follows_the_ground(scanner):
     slope = quad("Slope", (-500, -500, 0), (1500, -500, 200), (1500, 1500, 200), (-500, 1500, 0))
     ground = Terrain(Scene.from_meshes([slope]))
