@@ -416,8 +416,8 @@ def rejection_reason(scheduler: Any, name: str, slots: float, divided_on: str) -
     if divided_on and not members and not has_rule(scheduler, name):
         if divided_on != scheduler.id:
             return (
-                f"The scheduler was restarted, and partition {name!r} does not exist on the new "
-                "one. Divide the pool again."
+                f"Partition {name!r} was lost when the scheduler was restarted. "
+                "Divide the pool again."
             )
         return f"Partition {name!r} was dissolved. Divide the pool again, or use another partition."
     steward: Steward | None = scheduler.plugins.get(STEWARD)

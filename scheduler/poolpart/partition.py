@@ -240,7 +240,7 @@ class Partition:
             to addresses when the task reaches the scheduler. If these workers leave or restart, the
             task waits forever.
         timeout_s
-            Maximum running time in seconds, without the time before the task starts. A task that
+            Maximum running time in seconds, measured from the start of the task. A task that
             runs longer fails with `TaskTimeoutError`, or runs again on another worker if it has
             `retries` left. It is checked about twice a second. If the function does not return
             within 5 s, for example because it does not check `cancelled`, its worker is restarted
@@ -351,7 +351,7 @@ class Partition:
         window
             Maximum number of tasks in flight. By default, the number is chosen so that workers do
             not have to wait for the client: two tasks for each slot or, if tasks are short, one
-            second of work for each slot. Slots that are the share of other clients do not count.
+            second of work for each slot. Slots in the share of other clients do not count.
             The number doubles if workers and client have waited for each other, for example because
             the client computes between results. It is limited to 512 tasks and 64 MiB of items and
             results, and adapts to the number of slots.
@@ -491,7 +491,7 @@ class Partition:
         wait
             If False, return a future immediately. A thread of this process submits the tasks.
         window
-            Maximum number of tasks in flight. By default, it is two for each slot that is not the
+            Maximum number of tasks in flight. By default, it is two for each slot outside the
             share of other clients, and increases to up to 16 for each slot if slots become idle
             before this process can submit further tasks. It adapts to the number of slots.
         priority, retries, slots, timeout_s
@@ -566,8 +566,8 @@ class Partition:
             100 s, even if a restarted worker has not rejoined.
         recompute
             Whether workers may also be restarted if they run other tasks, or hold results that
-            cannot be copied. These tasks run again. Scattered data cannot be computed again, so
-            its worker is not restarted.
+            cannot be copied. These tasks run again. A worker that holds scattered data is
+            not restarted, because the data cannot be computed again.
 
         Returns
         -------

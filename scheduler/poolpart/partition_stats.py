@@ -58,7 +58,7 @@ class SharedQueue:
 
 @dataclass(frozen=True)
 class ClientStats:
-    """Use of a partition by one client, which includes the nested tasks of its tasks.
+    """Use of a partition by one client, including its nested tasks.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class PartitionStats(StageStats):
     stages
         Counts of each stage, by name.
     clients
-        Use of the partition by each client, by name or, if a client has no name, by its ID.
+        Use of the partition by each client, keyed by its name or, if it has no name, its ID.
     since
         Time in UTC when counting began.
     queue

@@ -515,8 +515,8 @@ class Pool:
         ----------
         client
             Client, or the name of a client, as in ``Client(address, name="alice")``. Clients with
-            the same name share one weight. The name is known to the scheduler from now on, also
-            when the client returns, and before its first task.
+            the same name share one weight. The scheduler keeps the weight when the client
+            disconnects. It can be set before a client with this name connects.
         weight
             Positive number. A client with a weight of 3 gets three times as much slot time as one
             with a weight of 1.

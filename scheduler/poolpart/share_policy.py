@@ -1,8 +1,8 @@
 """Decide whose task runs next, so that the clients of a partition get fair shares of its slots.
 
-The policy knows clients, weights and running times, but nothing of Dask, so that it can be tested
-and simulated by values alone. It only chooses a client. The order of a client's own tasks is up to
-the caller.
+The policy knows clients, weights and running times, but does not depend on Dask, so that it can be
+tested and simulated with plain values. It only chooses a client. The order of a client's own tasks
+is up to the caller.
 
 The algorithm is start-time fair queueing. Each client has a *tag*: the slot time in seconds that
 its tasks have used, divided by its weight. The waiting client with the lowest tag is next, and its

@@ -650,14 +650,14 @@ FAR = [*range(100), *range(101, 131), 100, *range(131, 76 * 4)]  # 30 packets la
 @pytest.mark.parametrize(
     ("order", "first_us", "notes"),
     [
-        (swapped(100), 0, ["1 packet in the wrong order"]),
-        (swapped(75), 0, ["1 packet in the wrong order"]),  # a sweep begins between them
-        (swapped(0), 0, ["1 packet in the wrong order"]),
-        (swapped(76 * 4 - 2), 0, ["1 packet in the wrong order"]),
-        (swapped(150), 3_599_999_999 - 150 * 1327, ["1 packet in the wrong order"]),  # a new hour
-        (LATE_BY_10, 0, ["1 packet in the wrong order"]),
-        (np.repeat(range(76 * 4), 2), 0, ["304 repeated packets"]),
-        (np.repeat(swapped(100), 2), 0, ["1 packet in the wrong order", "304 repeated packets"]),
+        (swapped(100), 0, ["1 packet out of order"]),
+        (swapped(75), 0, ["1 packet out of order"]),  # a sweep begins between them
+        (swapped(0), 0, ["1 packet out of order"]),
+        (swapped(76 * 4 - 2), 0, ["1 packet out of order"]),
+        (swapped(150), 3_599_999_999 - 150 * 1327, ["1 packet out of order"]),  # a new hour
+        (LATE_BY_10, 0, ["1 packet out of order"]),
+        (np.repeat(range(76 * 4), 2), 0, ["304 duplicate packets"]),
+        (np.repeat(swapped(100), 2), 0, ["1 packet out of order", "304 duplicate packets"]),
         (range(76 * 4), 0, []),
         (range(76 * 4), 3_599_999_999 - 150 * 1327, []),
     ],
@@ -685,7 +685,7 @@ def test_packets_of_a_velodyne_are_sorted(tmp_path, order, first_us, notes):
 
 
 def test_a_velodyne_whose_clock_is_set_back_keeps_its_packets(tmp_path):
-    """A repeated revolution, and packets that are too late, are no repeated packets."""
+    """A repeated revolution, and packets that are too late, are not duplicates."""
     pytest.importorskip("velodyne_decoder")
     packets = [*round_room()]
     for order in ([*range(200), *range(124, 76 * 4)], FAR):

@@ -409,8 +409,8 @@ def test_invalid_transforms_are_skipped(tmp_path, change):
         np.testing.assert_allclose(recording.poses(range(SWEEPS))[:, 0, 3], expected, atol=1e-6)
     (note,) = recording.notes
     assert note == (
-        f"{path} has invalid transforms on its tf topics, which contain NaN or a quaternion whose "
-        "length is not 1. Their times are 1700000000.300000000 (seconds). They are skipped"
+        f"{path} has invalid transforms on its tf topics at 1700000000.300000000 s. They contain "
+        "NaN or a quaternion whose length is not 1. They are skipped"
     )
     with pytest.raises(LidarError, match=r"invalid transforms .* 1700000000\.3.*Remove them"):
         load_trajectory(path, topic="/tf:lidar")

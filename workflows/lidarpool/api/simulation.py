@@ -119,8 +119,8 @@ def simulate(
     resume
         Whether to continue an unfinished run in `folder`, which is required. If there is none, a
         new run is started. `on_frame` is called with the frames that it has not received yet.
-        Frames that it received in the last second before the earlier run died are repeated, or
-        those of the last few seconds if `folder` is a URL.
+        It may receive frames again that it received in the last second before the earlier run
+        died, or in the last few seconds if `folder` is a URL.
 
     Returns
     -------

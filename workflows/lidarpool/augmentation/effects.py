@@ -47,7 +47,7 @@ class Insertion:
         Semantic class of the object, or an empty string. Names that data sets use for the same
         class, such as "person" and "pedestrian", are equivalent.
     name
-        Name of the object, by which materials select it. The default is the name of the mesh. If
+        Name by which materials select the object. The default is the name of the mesh. If
         several objects have the same name, numbers are appended, as in "car_2".
     """
 

@@ -191,8 +191,8 @@ class _Placement(NamedTuple):
     metavar="SHAPE",
     multiple=True,
     shell_complete=completion.insertions,
-    help="Insert a car, a pedestrian or a mesh file; can be repeated. The options --at, --heading, "
-    "--class and --name after it belong to this object.",
+    help="Insert a car, a pedestrian or a mesh file. Can be repeated. The options --at, --heading, "
+    "--class and --name that follow apply to this object.",
 )
 @click.option(
     "--at",

@@ -147,8 +147,8 @@ _SHARED = ("keep_noise", "on_progress")
     "--points",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Also write the deviation at each point to a .laz, .las, .ply or .e57 file, with its "
-    "level of detection. An existing file is replaced. With --survey.",
+    help="Also write the deviation at each point to a .laz, .las, .ply or .e57 file, replacing an "
+    "existing file. With m3c2, the file includes the level of detection. With --survey.",
 )
 @options.as_json
 @click.pass_context

@@ -144,8 +144,8 @@ class Recording:
     epsg
         EPSG code of the coordinates, or None if they are not in a known system with the unit meter.
     world_origin
-        Position of the local zero point in world coordinates, in meters, which lidarpool has added
-        to the points of a result. Shape (3,). None if nothing was added, or if it is unknown.
+        Local origin in world coordinates, in meters, that lidarpool has added to the points of a
+        result. Shape (3,). None if nothing was added, or if it is unknown.
     is_metric
         Whether the format defines coordinates as true meters, regardless of the coordinate system.
     sensor

@@ -294,10 +294,10 @@ def _near_surface_warnings(scene: Scene, survey: Survey) -> Iterator[str]:
             f"{near.points:.0%} of the points{f' of {carried.name}' * bool(carried.name)} are "
             f"behind surfaces that are closer than the minimum range of "
             f"{carried.sensor.min_range_m:g} m, such as {name!r} at "
-            f"{format_rounded(near.distance_m)} m, because rays pass through them. Change `mount` "
+            f"{format_rounded(near.distance_m)} m. Rays pass through such surfaces. Change `mount` "
             f"or the poses. If the object is the housing or the window of the sensor, add {name!r} "
-            "to `unseen` of the sensor. If the vehicle blocks these rays, state their directions "
-            "as `blocked_deg` in the sensor file"
+            "to `unseen` of the sensor. If the vehicle blocks these rays, set `blocked_deg` in "
+            "the sensor file to their directions"
         )
 
 

@@ -64,5 +64,5 @@ def _map(client: Client, function: Callable[[Any], Any], items: Iterable[Any]) -
             raise
         raise LostWorkersError(
             f"The cluster at {address} is no longer reachable, or the tasks of this "
-            "command were canceled by a different client."
+            "command were canceled by another client."
         ) from error

@@ -336,7 +336,7 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     chain = _chain(edges, frame)
     skipped = _skipped_transforms(chain)
     if not all(edge.rows for edge in chain):
-        raise LidarError(f"no transform of its frame {frame!r} can be used. It {skipped}.")
+        raise LidarError(f"no transform of its frame {frame!r} can be used. The bag {skipped}.")
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
     moving = [times for times, _ in tables if len(times) > 1]
     if not moving:
@@ -364,10 +364,10 @@ def _skipped_transforms(chain: Sequence[_Edge]) -> str:
         return ""
     listed = ", ".join(f"{time // 10**9}.{time % 10**9:09}" for time in times_ns[:_MAX_LISTED])
     others = len(times_ns) - _MAX_LISTED
-    more = f" and {others:,} more" if others > 0 else ""
+    more = f" and {others:,} more times" if others > 0 else ""
     return (
-        "has invalid transforms on its tf topics, which contain NaN or a quaternion whose length "
-        f"is not 1. Their times are {listed}{more} (seconds)"
+        f"has invalid transforms on its tf topics at {listed} s{more}. They contain NaN or a "
+        "quaternion whose length is not 1"
     )
 
 

@@ -19,7 +19,7 @@ _MAX_DELAY_US = 20_000
 
 
 class PacketOrder:
-    """Sorts the packets of one sensor by their device times, and drops repeated packets.
+    """Sorts the packets of one sensor by their device times, and drops duplicate packets.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class PacketOrder:
     late
         Number of packets that arrived after a packet that was sent later.
     repeated
-        Number of repeated packets, which were dropped.
+        Number of duplicate packets, which were dropped.
     """
 
     def __init__(self, time_us: Callable[[bytes], int], period_us: int) -> None:
@@ -92,7 +92,7 @@ def order_notes(orders: Iterable[PacketOrder]) -> list[str]:
     listed = [*orders]
     notes = []
     if late := sum(order.late for order in listed):
-        notes.append(f"has {plural(late, 'packet')} in the wrong order, sorted by device time")
+        notes.append(f"has {plural(late, 'packet')} out of order, which are sorted by device time")
     if repeated := sum(order.repeated for order in listed):
-        notes.append(f"has {plural(repeated, 'repeated packet')}, which are skipped")
+        notes.append(f"has {plural(repeated, 'duplicate packet')}, which are skipped")
     return notes

@@ -57,7 +57,7 @@ class Optics(FileSection):
 
     wavelength_nm: Annotated[
         Wavelength | None,
-        about("wavelength of the laser in nanometers; None if unknown, which is simulated as 905"),
+        about("laser wavelength in nanometers, or None if it is unknown and simulated as 905"),
     ] = None
     divergence_mrad: Annotated[
         Divergence | None,
