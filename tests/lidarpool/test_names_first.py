@@ -20,7 +20,7 @@ def unread(monkeypatch):
 
     for place in (
         "lidarpool.scenario.prepare.read_static_scene",
-        "lidarpool.comparing.fit.fitting.open_recording",
+        "lidarpool.comparing.fit.fitting.as_recording",
         "lidarpool.reconstruction.building.RecordedSweeps.open",
     ):
         monkeypatch.setattr(place, read)

@@ -199,7 +199,8 @@ def test_a_given_unit_counts_and_is_noted(tmp_path):
     (lower, upper), (note,) = bounds_of(path, unit="m")
     np.testing.assert_allclose(upper - lower, np.ptp(points, axis=0), atol=0.1)
     assert "EPSG:3857" in note and "As specified, its coordinates are read in m" in note
-    notes = compare(path, path, unit_a="m", unit_b="m").figures["notes"]
+    other = written(tmp_path / "other.las", points, wkt("EPSG:3857"))
+    notes = compare(path, other, unit_a="m", unit_b="m").figures["notes"]
     assert sum("As specified" in note for note in notes) == 2
     degrees = written(tmp_path / "b.las", ground("EPSG:4326"), wkt("EPSG:4326"))
     assert "has angular coordinates" in open_recording(degrees, unit="m").notes[0]

@@ -129,7 +129,7 @@ def test_lines_of_what_is_written_come_seldom(monkeypatch):
     for frame in range(1, 41):
         now += 0.25
         show("film", frame, 40, "frames")
-    assert lines_of(stream) == [f"film  {done} of 40 frames" for done in (8, 16, 24, 32)]
+    assert lines_of(stream) == [f"film  {done} of 40 frames" for done in (9, 17, 25, 33)]
 
 
 @pytest.mark.parametrize("terminal", [True, False])

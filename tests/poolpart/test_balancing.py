@@ -433,11 +433,12 @@ def test_a_partition_of_a_group_cannot_become_adaptive(start):
 def test_an_error_in_the_block_is_not_replaced_by_that_of_a_closed_client(start):
     client = start({name: {} for name in "ab"})
     divide(client, A=1, B=1)
-    with Client(client.cluster) as other:
-        group = balance(other, ["A", "B"])
+    other = Client(client.cluster)
+    group = balance(other, ["A", "B"])
 
     def fail_in_block():
         with group:
+            other.close()
             raise ValueError("of the block")
 
     with pytest.raises(ValueError, match="of the block") as caught:

@@ -12,7 +12,7 @@ import numpy as np
 from ..columns.bags import opened_bag, read_messages
 from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
-from ..numerics.vectors import matmul, matvec
+from ..numerics.vectors import matmul, matvec, norm
 from ..words import did_you_mean, join_names, plural
 from .navigation import from_geodetic
 from .rotations import quaternions_of
@@ -33,6 +33,7 @@ _GNSS = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
+_SECOND_NS = 1_000_000_000
 _MAX_LISTED = 3  # maximum number of times in a message
 _MAX_DIFFERENCE = 1e-6  # maximum difference between two copies of a pose that was sent twice
 _READABLE_TYPES = ", ".join([*_POSES, _GNSS, _FRAMES])
@@ -71,7 +72,7 @@ class _Edge:
 
     def add(self, time_ns: int, row: list[float]) -> None:
         """Add a pose. Invalid poses are skipped, as in tf2."""
-        length = float(np.linalg.norm(row[3:]))
+        length = float(norm(np.asarray(row[3:])))
         if np.isfinite(row).all() and abs(length - 1) <= QUATERNION_SLACK:
             self.times_ns.append(time_ns)
             self.rows.append(row)
@@ -362,7 +363,7 @@ def _skipped_transforms(chain: Sequence[_Edge]) -> str:
     times_ns = sorted(time for edge in chain for time in edge.invalid_ns)
     if not times_ns:
         return ""
-    listed = ", ".join(f"{time // 10**9}.{time % 10**9:09}" for time in times_ns[:_MAX_LISTED])
+    listed = ", ".join(f"{time // _SECOND_NS}.{time % _SECOND_NS:09}" for time in times_ns[:_MAX_LISTED])
     others = len(times_ns) - _MAX_LISTED
     more = f" and {others:,} more times" if others > 0 else ""
     return (
