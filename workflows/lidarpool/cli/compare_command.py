@@ -13,7 +13,6 @@ from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import join_alternatives, join_names
 
 from . import shared_options as options
-from .terminal import Terminal
 
 if TYPE_CHECKING:
     from ..comparing.comparison import Comparison
@@ -205,6 +204,8 @@ def compare(
             f"`--points` is {points}, but its extension must be {join_alternatives(_POINT_FILES)}."
         )
     keep_freed_memory()
+    from .terminal import Terminal
+
     with Terminal(as_json=as_json).writing("comparing the clouds", logged=False) as show:
         comparison = _compared(survey, a, others, settings | {"on_progress": show})
     page = next(path for path in comparison.save(out) if path.suffix == ".html")

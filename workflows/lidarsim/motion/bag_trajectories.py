@@ -363,7 +363,9 @@ def _skipped_transforms(chain: Sequence[_Edge]) -> str:
     times_ns = sorted(time for edge in chain for time in edge.invalid_ns)
     if not times_ns:
         return ""
-    listed = ", ".join(f"{time // _SECOND_NS}.{time % _SECOND_NS:09}" for time in times_ns[:_MAX_LISTED])
+    listed = ", ".join(
+        f"{time // _SECOND_NS}.{time % _SECOND_NS:09}" for time in times_ns[:_MAX_LISTED]
+    )
     others = len(times_ns) - _MAX_LISTED
     more = f" and {others:,} more times" if others > 0 else ""
     return (
