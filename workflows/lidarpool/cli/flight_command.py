@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from lidarsim.numerics.arrays import Floats
 
     from ..plan.flight import FlightPlan
+    from ..plan.flight_area import Area
     from ..plan.flight_density import AreaDensity
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
@@ -209,17 +210,20 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
 
     from ..clouds.folder import check_not_existing, result_folder
     from ..plan.flight import plan_flight
+    from ..plan.flight_area import read_area
     from ..plan.flight_scanner import AirborneScanner
     from .terminal import Terminal
 
     terminal = Terminal(quiet=as_json)
-    # An unsuitable sensor is reported before the scene is read.
+    # An unsuitable sensor and existing files are reported before the scene is read.
     scanner = AirborneScanner.load(full_name(model), settings.pop("fov_deg"))
-    site = _read_site(area, settings.pop("terrain"), settings.pop("epsg"), of_mesh, terminal)
-    folder = settings.pop("out") or Path(f"{site.name}-flight")
+    drawn = read_area(area)
+    folder = settings.pop("out") or Path(f"{_area_name(area, drawn)}-flight")
     with result_folder(folder):
-        files = (folder / name for name in FILES)
-        check_not_existing(files, overwrite=settings.pop("overwrite"))
+        check_not_existing((folder / name for name in FILES), overwrite=settings.pop("overwrite"))
+        site = _read_site(
+            area, drawn, settings.pop("terrain"), settings.pop("epsg"), of_mesh, terminal
+        )
         with terminal.status("planning the flight lines"):
             plan = plan_flight(site.shape, site.terrain, scanner, **settings)
         sections, omissions = _site_sections(plan, site, folder)
@@ -244,7 +248,6 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
 class _Site(NamedTuple):
     """Area to survey and its terrain."""
 
-    name: str
     shape: Any  # Shapely polygon in scenario coordinates
     terrain: Any
     scenario: Scenario | None  # scenario with the terrain, or None for level ground
@@ -256,19 +259,22 @@ class _Site(NamedTuple):
 
 def _read_site(
     area: str,
+    drawn: Area | None,
     terrain: Path | None,
     epsg: int | None,
     of_mesh: dict[str, Any],
     terminal: Terminal,
 ) -> _Site:
-    """Read the area and the terrain, and convert the area to the coordinates of the terrain."""
+    """Read the terrain, and convert the area to the coordinates of the terrain.
+
+    `drawn` is the area as drawn, or None if `area` is the path of a mesh or a scenario.
+    """
     import numpy as np
 
-    from ..plan.flight_area import GEOGRAPHIC, import_shapely, read_area, utm_epsg
+    from ..plan.flight_area import GEOGRAPHIC, import_shapely, utm_epsg
     from ..plan.flight_lines import Terrain
 
     shapely = import_shapely()
-    drawn = read_area(area)
     if drawn is None and terrain is not None:
         raise click.UsageError(
             f"`--terrain` requires an area in GeoJSON, WKT or bounds, but {area} is a mesh or a "
@@ -287,9 +293,7 @@ def _read_site(
         if drawn.epsg is not None:
             origin[:2] = np.floor(np.array(shape.centroid.coords[0]) / _ORIGIN_M) * _ORIGIN_M
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
-        return _Site(
-            _area_name(area), shape, Terrain(), None, epsg, origin, planned_columns(_FORMATS), []
-        )
+        return _Site(shape, Terrain(), None, epsg, origin, planned_columns(_FORMATS), [])
     from ..scenario.scenario import Scenario
 
     scenario = Scenario.load(source, of_mesh)
@@ -310,9 +314,7 @@ def _read_site(
         shape = _in_system(drawn, epsg)
         if drawn.epsg is not None:
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
-    name = source.stem if drawn is None else _area_name(area)
     return _Site(
-        name,
         shape,
         Terrain(scene),
         scenario,
@@ -338,10 +340,14 @@ def _in_system(drawn: Any, epsg: int | None) -> Any:
     return transform_shape(drawn.shape, drawn.epsg, epsg)
 
 
-def _area_name(area: str) -> str:
-    """Return a name for the output folder, which is the name of the area file or "area"."""
+def _area_name(area: str, drawn: Area | None) -> str:
+    """Return a name for the output folder, which is the name of the file or "area"."""
     path = Path(area)
-    return path.stem if path.suffix in (".geojson", ".json", ".wkt", ".txt") else "area"
+    return (
+        path.stem
+        if drawn is None or path.suffix in (".geojson", ".json", ".wkt", ".txt")
+        else "area"
+    )
 
 
 def _write_plan(

@@ -103,7 +103,7 @@ def import_atomically(
     survey
         File of the survey.
     folder
-        Output folder, which must not exist.
+        Output folder, which does not exist yet.
     assets
         Folders in which references in the survey are resolved.
     check
@@ -116,10 +116,8 @@ def import_atomically(
     Raises
     ------
     LidarError
-        If the folder exists, the survey cannot be converted, or the scenario is invalid.
+        If the survey cannot be converted, or the scenario is invalid.
     """
-    if folder.exists():
-        raise LidarError(f"{folder} already exists. Pass another folder with `--out`.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

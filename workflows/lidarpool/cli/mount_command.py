@@ -68,7 +68,8 @@ def mount(
         FIGURES_FILE,
         PAGE_FILE,
         SCENARIO_FILE,
-        study_files,
+        STUDY_FILES,
+        target_files,
         write_study,
     )
     from ..processes.fork_server import keep_freed_memory
@@ -78,10 +79,11 @@ def mount(
 
     keep_freed_memory()
     terminal = Terminal(quiet=as_json)
-    study = MountStudy.from_file(VehicleFile.load(vehicle))
     folder = Path(f"{vehicle.stem}-mounts") if out is None else out
     with result_folder(folder):
-        check_not_existing((folder / name for name in study_files(study)), overwrite=overwrite)
+        check_not_existing((folder / name for name in STUDY_FILES), overwrite=overwrite)
+        study = MountStudy.from_file(VehicleFile.load(vehicle))
+        check_not_existing((folder / name for name in target_files(study)), overwrite=overwrite)
         client = nullcontext() if scheduler is None else connect_client(scheduler, files)
         with client as connected, terminal.status("simulating the sensors at all mounts"):
             result = study.run(client=connected, workers=workers)

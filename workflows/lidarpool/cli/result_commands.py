@@ -181,6 +181,8 @@ def export(
     target = result if out is None else out
     if isinstance(result, Path) and result.is_file():
         raise LidarError(f"{result} is a file. Pass its folder, {result.parent}.")
+    specs = _make_export_specs(formats, **settings)
+    _check_not_existing(target, [chosen.row.file for chosen in specs], overwrite=overwrite)
     with local_result(result, (*required, PICTURE_FILE, *INSTRUMENT_FILES)) as source:
         for name in required:
             if not (source / name).exists():
@@ -191,12 +193,10 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        specs = _make_export_specs(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
             for chosen in specs:  # reports errors before any file is written
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
-                _check_not_existing(target, chosen.row.file, overwrite=overwrite)
             try:
                 for chosen in specs:
                     file = folder / chosen.row.file
@@ -215,14 +215,18 @@ def export(
                 raise
 
 
-def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
-    """Raise LidarError if a storage already contains a file that must not be overwritten."""
-    from lidarsim.io.storage import Storage  # imported late to keep --help fast
+def _check_not_existing(target: Path | Storage, files: Sequence[str], *, overwrite: bool) -> None:
+    """Raise LidarError if the target already contains a file that must not be overwritten."""
+    from ..clouds.folder import check_not_existing  # imported late to keep --help fast
 
-    if isinstance(target, Storage) and not overwrite and file in target.entries():
+    if isinstance(target, Path):
+        check_not_existing((target / file for file in files), overwrite=overwrite)
+        return
+    existing = set() if overwrite else set(files) & set(target.entries())
+    if existing:
         raise LidarError(
-            f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "
-            "`--overwrite`."
+            f"{target.path(min(existing))} already exists. Pass another folder with `--out`, or "
+            "pass `--overwrite`."
         )
 
 

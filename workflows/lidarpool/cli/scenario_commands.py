@@ -159,6 +159,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         prepare(Scenario.load(path))
 
     folder = out or Path(survey.stem)
+    if folder.exists():  # before the survey is read to determine its format
+        raise LidarError(f"{folder} already exists. Pass another folder with `--out`.")
     if survey.suffix.lower() in WORLDS:
         unsupported = import_atomically(import_world, survey, folder, assets, check)
     elif is_mujoco_model(survey):
@@ -581,6 +583,8 @@ def sensors(
             raise click.UsageError("Specify the model to export, or pass `--calibration FILE`.")
         _list_models()
         return
+    if out is not None and out.exists() and not overwrite:
+        raise LidarError(f"{out} already exists. Use another name, or pass `--overwrite`.")
     if model is not None:
         _show_model(model)
     if out is None:
@@ -591,7 +595,7 @@ def sensors(
         return
     sensor = load_sensor(model, **settings)
     if out.suffix.lower() != ".png" or file_format is not None:
-        _write_sensor(sensor, out, overwrite, file_format, seconds, revolutions)
+        _write_sensor(sensor, out, file_format, seconds, revolutions)
         return
     if seconds is not None or revolutions is not None:
         raise click.UsageError("`--seconds` and `--revolutions` cannot be used with a .png file.")
@@ -604,7 +608,6 @@ def sensors(
 def _write_sensor(
     sensor: Sensor,
     out: Path,
-    overwrite: bool,
     file_format: str | None,
     seconds: float | None,
     revolutions: int | None,
@@ -612,8 +615,6 @@ def _write_sensor(
     """Export a sensor to a file, and print which properties the file format cannot store."""
     from lidarsim.sensor.export import export_sensor
 
-    if out.exists() and not overwrite:
-        raise LidarError(f"{out} already exists. Use another name, or pass `--overwrite`.")
     file = export_sensor(sensor, out, format=file_format, seconds=seconds, revolutions=revolutions)
     size = plural(len(file.rays), "ray") if len(file.rays) else plural(sensor.channels, "channel")
     click.echo(f"{size}: {click.format_filename(out)}")

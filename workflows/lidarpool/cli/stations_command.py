@@ -180,18 +180,18 @@ def stations(
         sight = {key: settings[key] for key in ("slant_deg", "targets")}
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
     else:
-        scenario = Scenario.load(scene, of_mesh)
-        own = scenario.sensor
-        if model is None and own.model is None and own.calibration is None:
-            raise click.UsageError(
-                f"`--sensor` is required, because {scene} does not specify a sensor model."
-            )
         out = settings.pop("out")
         overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
         with result_folder(folder):
             files = (folder / name for name in (PLAN_FILE, PICTURE_FILE))
             check_not_existing(files, overwrite=overwrites)
+            scenario = Scenario.load(scene, of_mesh)
+            own = scenario.sensor
+            if model is None and own.model is None and own.calibration is None:
+                raise click.UsageError(
+                    f"`--sensor` is required, because {scene} does not specify a sensor model."
+                )
             _plan(scenario, model, folder, **settings)
 
 

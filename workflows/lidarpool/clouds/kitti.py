@@ -266,11 +266,19 @@ def flow_arrays(points: Floats32, flow: Floats32, camera: Floats) -> dict[str, F
     }
 
 
+def first_sequence(job: int | None) -> str:
+    """Return the name of the first sensor's sequence.
+
+    `job` is the number of a job in a data set, or None for a single survey.
+    """
+    return f"{job or 0:02}"
+
+
 def sequence_names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     """Return the name of each sensor's sequence."""
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
-    first = f"{entry.number:02}"
+    first = first_sequence(entry.number)
     names = make_identifiers(name or "lidar" for name in sweeps.sensors)[1:]
     return [first, *(f"{first}_{name}" for name in names)]
 

@@ -32,18 +32,15 @@ SCENARIO_FILE = "best.yaml"
 PAGE_FILE = "report.html"
 FIGURES_FILE = "mount.json"
 VEHICLE_FILE = "vehicle.glb"
+STUDY_FILES = (SCENARIO_FILE, FIGURES_FILE, PAGE_FILE, VEHICLE_FILE)  # files of every study
 TARGETS_FOLDER = "targets"
 SHOWN_CANDIDATES = 50  # rows of the table in the report
 _SHOWN_DISTANCE_M = 10.0  # distance of the targets in the scenario
 _SHOWN_TARGETS = 12
 
 
-def study_files(study: MountStudy) -> list[str]:
-    """Return the names of the files that `write_study` writes for a study."""
-    return [SCENARIO_FILE, FIGURES_FILE, PAGE_FILE, VEHICLE_FILE, *_target_files(study)]
-
-
-def _target_files(study: MountStudy) -> list[str]:
+def target_files(study: MountStudy) -> list[str]:
+    """Return the names of the files that `write_study` writes in addition to `STUDY_FILES`."""
     count = min(len(study.placements.meshes), _SHOWN_TARGETS)
     return [f"{TARGETS_FOLDER}/{number:02}.glb" for number in range(count)]
 
@@ -62,7 +59,7 @@ def write_study(result: MountRanking, folder: Path) -> list[Path]:
     ):
         (staged / TARGETS_FOLDER).mkdir()
         meshes = {VEHICLE_FILE: result.study.evaluator.body}
-        files = _target_files(result.study)
+        files = target_files(result.study)
         meshes |= dict(zip(files, result.study.placements.meshes, strict=False))
         for name, mesh in meshes.items():
             write_scene(staged / name, Scene.from_meshes([mesh]))
@@ -96,7 +93,7 @@ def _title(result: MountRanking) -> str:
     return Path(result.study.vehicle.source).stem
 
 
-def _scenario(result: MountRanking, folder: Path, target_files: Sequence[str]) -> str:
+def _scenario(result: MountRanking, folder: Path, targets: Sequence[str]) -> str:
     """Return the text of a scenario with the best candidate and a target of each shape."""
     vehicle = result.study.vehicle
     near = {name for name, sensor in result.best.sensors.items() if sensor.blocked_near}
@@ -108,8 +105,8 @@ def _scenario(result: MountRanking, folder: Path, target_files: Sequence[str]) -
             for name, pose in result.best.candidate.mounts.items()
         },
         "poses": [[0.0, 0.0, 0.0]],
-        "actors": _target_actors(result, target_files),
-        "materials": [*_target_materials(result, len(target_files)), ground],
+        "actors": _target_actors(result, targets),
+        "materials": [*_target_materials(result, len(targets)), ground],
         **_conditions(vehicle),
         "cloud": {"columns": ["range"]},
     }

@@ -17,7 +17,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import list_names
 
 from ..clouds.cloud_format import Entry
-from ..clouds.kitti import MAX_INSTANCES, sequence_names
+from ..clouds.kitti import MAX_INSTANCES, first_sequence, sequence_names
 from ..clouds.nuscenes import sample_tokens
 from .class_names import OCC3D_CLASSES, occ3d_class
 
@@ -56,6 +56,15 @@ class GridLayout(ABC):
         self.sweeps = sweeps
         self.sensor = sensor
         self.count = int((sweeps.sensor == sensor).sum())
+
+    @classmethod
+    def first_path(cls, job: int | None) -> str | None:
+        """Return the path of a file of the first sweep of the first sensor.
+
+        `job` is the number of a job in a campaign, or None for a single scenario. Returns None if
+        the path depends on the survey.
+        """
+        return None
 
     @abstractmethod
     def paths(self, number: int) -> tuple[str, ...]:
@@ -145,12 +154,16 @@ class SemanticKitti(GridLayout):
 
     def __init__(self, sweeps: Sweeps, entry: Entry | None, sensor: int) -> None:
         super().__init__(sweeps, entry, sensor)
-        self._folder = f"sequences/{sequence_names(sweeps, entry)[sensor]}/voxels"
+        self._sequence = sequence_names(sweeps, entry)[sensor]
+
+    @classmethod
+    def first_path(cls, job: int | None) -> str:
+        """Return the path of the `.bin` file of the first sweep of the first sensor."""
+        return _voxel_files(first_sequence(job), 0)[0]
 
     def paths(self, number: int) -> tuple[str, ...]:
         """Return the paths of the five files of a sweep."""
-        endings = ("bin", "label", "occluded", "invalid", "instance")
-        return tuple(f"{self._folder}/{number:06}.{ending}" for ending in endings)
+        return _voxel_files(self._sequence, number)
 
     def contents(self, occupancy: Occupancy) -> tuple[bytes, ...]:
         """Return the contents of the five files of a sweep."""
@@ -163,6 +176,12 @@ class SemanticKitti(GridLayout):
             _packed(~occupancy.observed_later),
             _as_uint16(occupancy.instances + 1),
         )
+
+
+def _voxel_files(sequence: str, number: int) -> tuple[str, ...]:
+    """Return the paths of the files of a sweep in the layout of SemanticKITTI."""
+    endings = ("bin", "label", "occluded", "invalid", "instance")
+    return tuple(f"sequences/{sequence}/voxels/{number:06}.{ending}" for ending in endings)
 
 
 def _packed(voxels: Bools) -> bytes:

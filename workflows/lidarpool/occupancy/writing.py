@@ -223,6 +223,10 @@ def write_occupancy(
     """
     path = path.absolute()
     numbers = _job_numbers(path, job)
+    info = _info(settings)
+    if not overwrite:
+        _check_same_grid(out / INFO_FILE, info)
+        _check_first_files(out, settings, numbers)
     notes: dict[str, None] = {}
     tasks: list[_Task] = []
     for number in numbers:
@@ -234,9 +238,6 @@ def write_occupancy(
             _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
             for first in range(0, layout.count, _TASK_SWEEPS)
         ]
-    info = _info(settings)
-    if not overwrite:
-        _check_same_grid(out / INFO_FILE, info)
     total = sum(len(task.sweeps) for task in tasks)
     done = 0
     file_count = 0
@@ -286,6 +287,18 @@ def _check_same_grid(file: Path, info: bytes) -> None:
                 f"{file} already exists and describes another grid. Use another folder with "
                 "`--out`, or pass `--overwrite`."
             )
+
+
+def _check_first_files(
+    out: Path, settings: OccupancySettings, numbers: Sequence[int | None]
+) -> None:
+    """Raise LidarError if files exist whose names are known before the jobs are opened.
+
+    The names of other files depend on the survey, for example on the number of the sensor.
+    """
+    if settings.sensor is None:
+        first = map(LAYOUTS[settings.layout].first_path, numbers)
+        check_not_existing((out / path for path in first if path is not None), overwrite=False)
 
 
 def _info(settings: OccupancySettings) -> bytes:
