@@ -229,7 +229,7 @@ class Partition:
             run separately.
         priority
             Priority of the task among the tasks of the same client. Tasks with a higher priority
-            run first. Clients take turns, whatever their priorities are.
+            run first. Clients take turns regardless of priorities.
         retries
             Maximum number of times that the task runs again after an error.
         slots
@@ -244,8 +244,8 @@ class Partition:
             runs longer fails with `TaskTimeoutError`, or runs again on another worker if it has
             `retries` left. It is checked about twice a second. If the function does not return
             within 5 s, for example because it does not check `cancelled`, its worker is restarted
-            under the conditions of ``cancel(running="restart")``, as soon as other tasks on the
-            worker have finished, but at most after a minute.
+            under the conditions of ``cancel(running="restart")``. The restart waits up to a minute
+            for other tasks on the worker to finish.
 
         Returns
         -------

@@ -222,7 +222,7 @@ def test_points_without_a_time_are_counted():
     found = compare_surveys(a, cloud(points, gps_time=time))
     assert components(found, "delta_e")["count"] == 793
     assert found.figures["unpaired"] == {"a": 7, "b": 0}
-    note = "7 points of cloud B have a gps time that is not finite and are not compared"
+    note = "the comparison excludes 7 points of cloud B with a gps time that is not finite"
     assert note in found.figures["notes"]
 
 

@@ -10,7 +10,7 @@ NONE = "not simulated"  # value of `PointField.source` for fields that are never
 
 @dataclass(frozen=True)
 class PointField:
-    """Field of a point in a format, its standard or its usual readers.
+    """Point field of a format, including fields that only its standard or its readers define.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class PointField:
         Source of the field if it is not filled from columns, or `NONE` if it is never known.
     on_request
         Whether a run computes the columns only if they are listed in `cloud.columns`. Otherwise, it
-        computes them for the format without being asked.
+        always computes them for the format.
     if_named
         Whether the field is only written if the classes have names.
     """

@@ -634,7 +634,8 @@ def open_cloud(
     """
     if sensor and load_sweeps is None:
         raise LidarError(
-            f"{name} has no sweeps that state their sensor. Remove the sensor {sensor!r}."
+            f"{name} has no sweeps that state their sensor, so no sensor can be selected. Remove "
+            f"the sensor {sensor!r}."
         )
     fields |= {"intensity_column": intensity, "noise_classes": None}
     if load_sweeps is None:

@@ -78,7 +78,7 @@ class Twin:
     actors
         Moving objects of the recording.
     classes
-        Names of the semantic classes by number, as far as the recording states them.
+        Names of the semantic classes from the recording, keyed by class number.
     """
 
     scene: Scene

@@ -138,7 +138,10 @@ def open_recording(
     opened = RecordingSource(path, name, sensor, intensity, unit)
     recording = replace(_open_path(opened), world_origin=_world_origin(path))
     if sensor and not opened.selected:
-        raise LidarError(f"{name} does not name its sensor. Remove the sensor {sensor!r}.")
+        raise LidarError(
+            f"{name} does not name its sensor, so no sensor can be selected. Remove the sensor "
+            f"{sensor!r}."
+        )
     return replace(recording, noise_classes=None) if keep_noise else recording
 
 

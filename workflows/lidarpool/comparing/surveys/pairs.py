@@ -153,8 +153,8 @@ def pair_deviations(a: SurveyCloud, b: SurveyCloud, max_points: int) -> Deviatio
         if count
     ]
     notes += [
-        f"{plural(one.invalid_count, 'point')} of {cloud.name} have a {key.column_title} that is "
-        "not finite and are not compared"
+        f"the comparison excludes {plural(one.invalid_count, 'point')} of {cloud.name} with a "
+        f"{key.column_title} that is not finite"
         for cloud, one in zip((a, b), sampled, strict=True)
         if one.invalid_count
     ]
