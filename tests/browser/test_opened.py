@@ -6,6 +6,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.drives import the_scene, the_sweeps, write_set
 from tests.packet_surveys import points_of
@@ -114,6 +115,32 @@ def test_each_kind_of_file_is_opened(kinds, new_tab):
                 check_view(tab, view, name)
             tab.open("about:blank")  # asks nothing of a server that ends
     assert tab.errors == []
+
+
+def test_labeled_boxes_are_shown_with_their_names_in_their_sweeps(tmp_path, new_tab):
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "label_2").mkdir()
+    values = "0 0 0 1 2 3 4 1.5 1.8 4.2 -3 1.6 12 0.3"
+    for number, kind in enumerate(("Car", "Van")):
+        points = np.random.default_rng(number).uniform(-20, 20, (500, 4)) * (1, 1, 0, 0)
+        points.astype("<f4").tofile(tmp_path / f"velodyne/{number:06}.bin")
+        (tmp_path / f"label_2/{number:06}.txt").write_text(f"{kind} {values}\n")
+    with page_server(open_view(tmp_path).answer, port=0) as page:
+        tab = new_tab(page.url)
+        tab.resize(900, 600)
+        tab.wait_for(lambda text: drawn(tab) == 500 and "Car" in text and "Van" not in text, 20)
+        tab.key("ArrowRight")
+        tab.wait_for(
+            lambda text: "sweep 2 of 2" in text and "Van" in text and "Car" not in text, 20
+        )
+        box = "lidarpool.picture.actors[0].box.geometry"
+        tab.value(f"{box}.computeBoundingBox()")
+        half = tab.value(f"{box}.boundingBox.max.toArray()")
+        assert half == pytest.approx([2.1, 0.9, 0.75])
+        tab.value("lidarpool.picture.showBoxes(false)")
+        tab.wait_for(lambda text: "Van" not in text, 20)
+        assert tab.errors == []
+        tab.open("about:blank")
 
 
 def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new_tab, monkeypatch):

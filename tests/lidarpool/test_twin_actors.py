@@ -375,7 +375,9 @@ def test_boxes_are_required_if_they_were_chosen():
         read_stamps=None,
         count=4,
     )
-    with pytest.raises(LidarError, match=r"no labeled boxes\. Set `actors` to `clusters`"):
+    with pytest.raises(
+        LidarError, match=r"no labeled boxes of .* sweeps\. Set `actors` to `clusters`"
+    ):
         twin(recording, actors="boxes")
     with pytest.raises(LidarError, match="actors"):
         twin(recording, actors="labels")

@@ -1,8 +1,8 @@
 """Read the boxes of labeled objects in KITTI recordings.
 
-KITTI tracking and exports have `label_02/NAME.txt` beside the folders of the sequences, with
-positions in the camera frame. A drive of the raw data has `tracklet_labels.xml`, with positions in
-the frame of the lidar.
+KITTI tracking and exports have `label_02/NAME.txt` beside the folders of the sequences, and the
+KITTI object benchmark has `label_2/FRAME.txt`, both with positions in the camera frame. A drive of
+the raw data has `tracklet_labels.xml`, with positions in the frame of the lidar.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ TRACKLETS_FILE = "tracklet_labels.xml"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 LEVEL_CAMERA = affine(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3))
 _IGNORED = "DontCare"
-_LABEL_FIELDS = 17  # of a line in `label_02`, without the score of a detection
+OBJECTS_FOLDER = "label_2"
+_LABEL_FIELDS = 15  # of a line in `label_2`, without the score of a detection
+_TRACK_FIELDS = 2  # preceding fields of a line in `label_02`: the frame and the track
 _UPWARD = np.array([0.0, 0.0, 1.0])
 _Row = tuple[int, int, str, Floats, Sequence[float]]
 
@@ -51,12 +53,19 @@ def read_boxes(folder: Path, files: Sequence[Path]) -> RecordedBoxes | None:
         labels = root / "label_02" / f"{folder.absolute().name}.txt"
         if labels.exists():
             return RecordedBoxes.from_rows(_tracks(labels, _camera(folder, root), numbers))
+    if (folder / OBJECTS_FOLDER).is_dir():
+        return RecordedBoxes.from_rows(_objects(folder, files))
     return None
 
 
 def _camera(folder: Path, root: Path) -> Floats:
     """Return the transformation from the lidar to the rectified camera, of shape (4, 4)."""
-    for path in (folder / CALIBRATION_FILE, root / "calib" / f"{folder.absolute().name}.txt"):
+    return _camera_of(folder / CALIBRATION_FILE, root / "calib" / f"{folder.absolute().name}.txt")
+
+
+def _camera_of(*calibrations: Path) -> Floats:
+    """Return the transformation in the first calibration file that exists and contains one."""
+    for path in calibrations:
         if not path.exists():
             continue
         rows = read_calibration(path)
@@ -92,26 +101,62 @@ def read_calibration(path: Path) -> dict[str, Floats]:
 
 def _tracks(path: Path, camera: Floats, numbers: dict[int, int]) -> Iterator[_Row]:
     """Yield the boxes in a file of KITTI tracking whose frames have a point file."""
-    to_lidar = np.linalg.inv(camera)
+    to_lidar = np.asarray(np.linalg.inv(camera), np.float64)
     for line_number, line in enumerate(read_input_text(path).splitlines(), 1):
         fields = line.split()
-        if not fields or (len(fields) > 2 and fields[2] == _IGNORED):
+        if not fields or _IGNORED in fields[_TRACK_FIELDS : _TRACK_FIELDS + 1]:
             continue
         try:
-            frame, number = int(fields[0]), int(fields[1])
-            height, width, length, x, y, z, rotation_y = map(float, fields[10:_LABEL_FIELDS])
+            frame, number = map(int, fields[:_TRACK_FIELDS])
+            kind, pose, size = _label(fields[_TRACK_FIELDS:], to_lidar)
         except ValueError as error:
             raise LidarError(
                 f"{path.name}, line {line_number}: a label of KITTI tracking consists of "
-                f"{_LABEL_FIELDS} fields. Repair this line, or remove the file."
+                f"{_TRACK_FIELDS + _LABEL_FIELDS} fields. Repair this line, or remove the file."
             ) from error
         if frame not in numbers or number < 0:
             continue
-        position = np.array([x, y - height / 2, z, 1.0])
-        forward = to_lidar[:3, :3] @ [np.cos(rotation_y), 0.0, -np.sin(rotation_y)]
-        upward = to_lidar[:3, :3] @ [0.0, -1.0, 0.0]
-        pose = upright_pose((to_lidar @ position)[:3], forward, upward)
-        yield numbers[frame], number, fields[2], pose, (length, width, height)
+        yield numbers[frame], number, kind, pose, size
+
+
+def _objects(folder: Path, files: Sequence[Path]) -> Iterator[_Row]:
+    """Yield the boxes in `label_2`, which has a file for each sweep.
+
+    The labels do not identify objects, so each box belongs to a different object.
+    """
+    number = 0
+    for sweep, file in enumerate(files):
+        path = folder / OBJECTS_FOLDER / f"{file.stem}.txt"
+        if not path.exists():
+            continue
+        camera = _camera_of(folder / "calib" / path.name, folder / CALIBRATION_FILE)
+        to_lidar = np.asarray(np.linalg.inv(camera), np.float64)
+        for line_number, line in enumerate(read_input_text(path).splitlines(), 1):
+            fields = line.split()
+            if not fields or fields[0] == _IGNORED:
+                continue
+            try:
+                label = _label(fields, to_lidar)
+            except ValueError as error:
+                raise LidarError(
+                    f"{OBJECTS_FOLDER}/{path.name}, line {line_number}: a label of KITTI consists "
+                    f"of {_LABEL_FIELDS} fields. Repair this line, or remove the file."
+                ) from error
+            yield sweep, number, *label
+            number += 1
+
+
+def _label(fields: Sequence[str], to_lidar: Floats) -> tuple[str, Floats, Sequence[float]]:
+    """Return the type, the pose and the size of a labeled box, given its fields.
+
+    Raises ValueError if fields are missing or invalid.
+    """
+    height, width, length, x, y, z, rotation_y = map(float, fields[8:_LABEL_FIELDS])
+    position = np.array([x, y - height / 2, z, 1.0])
+    forward = to_lidar[:3, :3] @ [np.cos(rotation_y), 0.0, -np.sin(rotation_y)]
+    upward = to_lidar[:3, :3] @ [0.0, -1.0, 0.0]
+    pose = upright_pose((to_lidar @ position)[:3], forward, upward)
+    return fields[0], pose, (length, width, height)
 
 
 def _tracklets(path: Path, numbers: dict[int, int]) -> Iterator[_Row]:

@@ -70,6 +70,11 @@ class RecordedBoxes(NamedTuple):
                 rows.append((number, len(sweeps.objects) + actor, kind, pose, sizes[actor]))
         return cls.from_rows(rows)
 
+    @property
+    def are_tracked(self) -> bool:
+        """Whether objects are identified, so that an object has boxes in several sweeps."""
+        return len(np.unique(self.object)) < len(self.object)
+
     def section(self, first: int, count: int) -> RecordedBoxes:
         """Return the boxes of consecutive sweeps, which are numbered from 0."""
         rows = np.flatnonzero((self.sweep >= first) & (self.sweep < first + count))

@@ -18,7 +18,7 @@ from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 from lidarsim.words import plural
 from lidarview.viewer.point_selection import STATION, InMemoryPoints, Points, ScanOrderedPoints
-from lidarview.viewer.view import DownloadFormats, ProgressiveView, View
+from lidarview.viewer.view import DownloadFormats, LabeledObject, ProgressiveView, View
 
 from ..clouds.recording import Recording
 
@@ -122,11 +122,16 @@ def recorded_view(
     """
     first = next(iter(sensors.values()))
     further_notes: list[str] = []
+    labeled: list[LabeledObject] = []
     if first.is_cloud:
         cloud = _read_cloud(first, on_part)
         sweeps = None
     else:
         cloud, sweeps, further_notes = _read_sweeps(sensors)
+        try:
+            labeled = _labeled_objects([*sensors.values()], sweeps)
+        except LidarError as error:
+            further_notes.append(f"Labeled boxes are not shown. {error}")
     notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
     notes += further_notes
     notes += [note for recording in sensors.values() for note in recording.omission_notes]
@@ -147,7 +152,43 @@ def recorded_view(
         downloads=downloads,
         names=names,
         stated_epsg=first.epsg,
+        labeled_objects=labeled,
     )
+
+
+def _labeled_objects(sensors: Sequence[Recording], sweeps: Sweeps) -> list[LabeledObject]:
+    """Return the labeled objects in the sweeps of sensors.
+
+    An object that several sensors of a sequence observe is only returned once. Its name contains
+    its number if it has boxes in several sweeps.
+    """
+    objects: dict[tuple[str, int], LabeledObject] = {}
+    for sensor, recording in enumerate(sensors):
+        boxes = recording.boxes
+        if boxes is None:
+            continue
+        of_sensor = np.flatnonzero(sweeps.sensor == sensor)
+        ends_ns = np.append(np.nextafter(sweeps.begins_ns[of_sensor[1:]], 0), np.inf)
+        is_read = boxes.sweep < len(of_sensor)
+        for number in np.unique(boxes.object[is_read]).tolist():
+            rows = np.flatnonzero(is_read & (boxes.object == number))
+            rows = rows[np.unique(boxes.sweep[rows], return_index=True)[1]]  # sorted by sweep
+            shown = of_sensor[boxes.sweep[rows]]
+            poses = boxes.poses[rows]
+            if sweeps.coordinates == "world":
+                poses = np.stack([sweeps.pose.matrix(index) for index in shown.tolist()]) @ poses
+            times_ns = sweeps.begins_ns[shown]
+            kind = boxes.kinds[int(rows[0])] or "object"
+            labeled = LabeledObject(
+                f"{kind} {number}" if len(rows) > 1 else kind,
+                np.median(boxes.sizes[rows], axis=0),
+                times_ns,
+                poses[:, :3, 3],
+                quaternions_of(poses[:, :3, :3]),
+                (float(times_ns[0]), float(ends_ns[boxes.sweep[rows[-1]]])),
+            )
+            objects.setdefault((recording.sequence, number), labeled)
+    return [*objects.values()]
 
 
 def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:

@@ -248,11 +248,12 @@ def _actor_source(recorded: RecordedSweeps, chosen: ActorSource | None) -> Actor
     if chosen in ("clusters", "none"):
         return chosen
     boxes = recorded.recording.boxes
-    if boxes is not None and len(boxes.sweep):
+    if boxes is not None and boxes.are_tracked:
         return "boxes"
     if chosen == "boxes":
         raise LidarError(
-            f"{recorded.recording.name} contains no labeled boxes. Set `actors` to `clusters`, or "
+            f"{recorded.recording.name} contains no labeled boxes of objects that are identified "
+            "in several sweeps. Set `actors` to `clusters`, or "
             "omit it."
         )
     return "clusters"

@@ -58,11 +58,11 @@ class LabeledTracks(NamedTuple):
     def from_boxes(
         cls, boxes: RecordedBoxes | None, alignment: Alignment, mapped: Ints
     ) -> LabeledTracks | None:
-        """Return the tracks, or None without boxes.
+        """Return the tracks, or None without boxes of identified objects.
 
         `mapped` are the numbers of the sweeps that form the map.
         """
-        if boxes is None:
+        if boxes is None or not boxes.are_tracked:
             return None
         return cls(_labeled(boxes, alignment), _labeled(boxes, alignment, mapped))
 

@@ -104,6 +104,7 @@ def join_views(
         results=names,
         downloads=downloads,
         stated_epsg=codes.pop() if len(codes) == 1 else None,
+        labeled_objects=() if sweeps is None else first.labeled_objects,
     )
 
 

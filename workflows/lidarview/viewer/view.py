@@ -92,6 +92,18 @@ class DownloadFormats:
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's extension
 
 
+@dataclass(frozen=True, eq=False)
+class LabeledObject:
+    """Labeled object of a recording, which is shown as a box with its name."""
+
+    name: str
+    size: Floats  # (3,), length, width and height in meters
+    times_ns: Floats  # (k,), nanoseconds since the start of the recording
+    positions: Floats  # (k, 3), centers of the box in the coordinates of the points, meters
+    quaternions: Floats  # (k, 4)
+    presence_ns: tuple[float, float]  # times between which it is shown
+
+
 @dataclass(eq=False)
 class View:
     """A survey, or a cloud without a survey, as shown by a page.
@@ -115,6 +127,7 @@ class View:
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     preview: bool = False  # whether the points come from the first sweeps, before a run
     stated_epsg: int | None = None  # EPSG code in the point cloud file
+    labeled_objects: Sequence[LabeledObject] = ()
 
     def __post_init__(self) -> None:
         self.version = 0  # number of times that the points have been replaced
@@ -334,6 +347,7 @@ class View:
             arrays[f"sensor{number}_times"] = sensor.times_ns / _NS
             arrays[f"sensor{number}_places"] = sensor.positions
         arrays |= self._actor_arrays()
+        arrays |= self._box_arrays()
         sweeps = self.sweeps
         if sweeps is not None:
             arrays["sweep_scans"] = sweeps.scans.astype(np.float64)
@@ -379,12 +393,14 @@ class View:
                 {"name": actor.name, "class": classes.get(number)}
                 for number, actor in enumerate(self.actors, static_count)
             ],
+            "labeled": [{"name": labeled.name} for labeled in self.labeled_objects],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             # With actors, the page selects times instead of stations.
             "stations": [] if self.actors else self._station_names,
             "results": make_legend(make_coloring(result_numbers, RESULT, self.results))["labels"],
             "exports": self._export_formats,
             "actor_colors": as_bytes(object_colors(object_count))[static_count:].tolist(),
+            "labeled_colors": as_bytes(object_colors(len(self.labeled_objects))).tolist(),
             "statics": static_count,
             "duration": self.duration_ns / _NS,
             "path": self.planned_path,
@@ -427,6 +443,17 @@ class View:
                 arrays[f"actor{k}_frames"] = (
                     pose_numbers if animation.repeat else pose_numbers.clip(0, last)
                 )
+        return arrays
+
+    def _box_arrays(self) -> dict[str, AnyArray]:
+        """Return the sizes and the poses of labeled objects, like those of actors."""
+        arrays: dict[str, AnyArray] = {}
+        for k, labeled in enumerate(self.labeled_objects):
+            arrays[f"labeled{k}_size"] = labeled.size
+            arrays[f"labeled{k}_times"] = labeled.times_ns / _NS
+            arrays[f"labeled{k}_places"] = labeled.positions - self.origin
+            arrays[f"labeled{k}_turns"] = labeled.quaternions
+            arrays[f"labeled{k}_there"] = np.array(labeled.presence_ns) / _NS
         return arrays
 
     @property

@@ -1012,13 +1012,21 @@ function takeState(told) {
     for (const sensor of own) sensor.begins = Float64Array.from(sensor.sweeps, (sweep) => sweep.begin);
   }
   picture.setSensors(own);
-  picture.setActors(state.actors.map((actor, k) => ({
+  const actors = state.actors.map((actor, k) => ({
     label: [actor.name, state.classes[actor.class] ?? ""].filter(Boolean).join(" · "), object: state.statics + k, color: state.actor_colors[k],
     corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colors`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
     there: arrays[`actor${k}_there`], frames: arrays[`actor${k}_frames`],
     poses: arrays[`mesh${arrays.actor_mesh[k]}_poses`], faces: arrays[`mesh${arrays.actor_mesh[k]}_faces`],
-  })));
+  }));
+  // Labeled objects have no surface: their corners only span the box.
+  const labeled = state.labeled.map(({ name }, k) => ({
+    label: name, object: null, color: state.labeled_colors[k],
+    corners: Float32Array.from([-1, 1, 1].flatMap((side) => [...arrays[`labeled${k}_size`]].map((length) => (side * length) / 2))),
+    times: arrays[`labeled${k}_times`], places: arrays[`labeled${k}_places`], turns: arrays[`labeled${k}_turns`],
+    there: arrays[`labeled${k}_there`],
+  }));
+  picture.setActors([...actors, ...labeled]);
   picture.setRays(arrays.rays);
   document.title = state.title;
 }

@@ -321,7 +321,7 @@ export class Picture {
   // limits: [lowest, highest] displayed object, or null; hidden: objects that are switched off
   showObjects(limits, hidden) {
     Object.assign(this, { onlyObjects: limits, hiddenObjects: hidden });
-    const shown = (object) => (!limits || (object >= limits[0] && object <= limits[1])) && !hidden.has(object);
+    const shown = (object) => object === null || ((!limits || (object >= limits[0] && object <= limits[1])) && !hidden.has(object));
     if (this.surface) {
       const { objects, geometry } = this.surface;
       if (!limits && !hidden.size) geometry.setIndex(null);
