@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from lidarpool import LidarError
+from lidarpool.augmentation import running
 from lidarpool.cli.commands import cli
 
 VOXELS = "sequences/00/voxels/000000.bin"
@@ -66,6 +68,18 @@ def test_existing_outputs_are_reported_before_inputs_are_read(command, existing)
     else:
         file.rmdir()
     assert "missing" in message(command)
+
+
+def test_an_existing_augmentation_is_reported_before_the_recording_is_hashed(monkeypatch):
+    hashed = []
+    monkeypatch.setattr(running, "fingerprint_files", lambda path: hashed.append(path) or "hash")
+    Path("drive").mkdir()
+    np.ones((40, 4), "<f4").tofile("drive/000000.bin")
+    command = "augment drive --out wet --rain 5 --workers 1 --quiet"
+    Path("wet").mkdir()
+    assert message(command) == "wet already exists. Use another path, or pass `--overwrite`."
+    assert not hashed and [*Path("wet").iterdir()] == []
+    assert "All intensities of drive are 1" in message(f"{command} --overwrite") and hashed
 
 
 @pytest.mark.parametrize("options", ["", "--sensor roof", "--voxel-size 0.8"])

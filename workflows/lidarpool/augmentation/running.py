@@ -25,6 +25,7 @@ from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.versions import software
 from ..work.mapping import MapFunction, parallel_map
+from .rewriting.data_set_copy import check_target
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
     CHECKED_SENSORS,
@@ -197,6 +198,9 @@ class Augmentation:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
                 stack.enter_context(result_folder(WorkFolder.for_output(out), shown=out))
+                if not overwrite and not WorkFolder.is_unfinished(out):
+                    for target in targets:  # before the recording is hashed
+                        check_target(target, self.file.path, overwrite=False)
                 identity = self._identity()
                 work = WorkFolder.create_or_resume(
                     out, identity, resume=resume, overwrite=overwrite

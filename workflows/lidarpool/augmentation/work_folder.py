@@ -47,6 +47,11 @@ class WorkFolder:
         return out.with_name(f"{out.name}{SUFFIX}")
 
     @classmethod
+    def is_unfinished(cls, out: Path) -> bool:
+        """Return whether there is an unfinished augmentation for an output."""
+        return (cls.for_output(out) / _MANIFEST).exists()
+
+    @classmethod
     def create_or_resume(
         cls, out: Path, identity: Mapping[str, str], *, resume: bool, overwrite: bool
     ) -> WorkFolder:
