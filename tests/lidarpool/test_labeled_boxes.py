@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.packet_surveys import points_of
 
-from lidarpool import LidarError, open_recording
+from lidarpool import (
+    Actor,
+    LidarError,
+    Mounted,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    box,
+    open_recording,
+)
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.pages.opened import open_view, open_views
 
 # Height, width, length, bottom center in camera axes (right, down, forward), and rotation_y.
@@ -116,3 +130,29 @@ def test_boxes_of_tracks_are_placed_in_the_world(tracked):
 
 def test_boxes_remain_if_a_recording_is_shown_beside_others(tracked):
     assert [box[0] for box in labeled(open_views([tracked, tracked])).values()] == ["Car 4", "Van"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "origin_m"),
+    [("kitti", "Car 2", 2), ("nuscenes", "Car 0", 0), ("mcap", "Car 0", 0)],
+)
+def test_boxes_of_exported_actors_are_shown_where_the_actors_were(tmp_path, kind, name, origin_m):
+    car = Actor(box("Car 1", (4, 2, 1.5)), Track([0, 0.3], [[8, 1, 0], [11, 1, 0]]))
+    scene = Scene.from_meshes([box("Floor", (60, 60, 0.1))]).with_actors([car])
+    survey = Survey(
+        sensors=[Mounted(Sensor.grid(layers=6), name="roof")],
+        trajectory=Track([0, 0.3], [[0, 0, 2], [3, 0, 2.0]]),
+        columns=["ray", "range", "intensity", "reflectivity", "time", "object", "class"],
+    )
+    cloud, sweeps = points_of(survey, scene)
+    export = ExportSpec(kind)
+    export.write(tmp_path / export.row.file, replace(cloud, sweeps=lambda: sweeps), sweeps)
+    view = open_view(tmp_path / export.row.file)
+    (shown,) = labeled(view).values()
+    assert shown[0] == name and shown[1] == pytest.approx([4, 2, 1.5])
+    expected = np.column_stack(
+        [8 + 10 * shown[2], np.ones(len(shown[2])), np.full(len(shown[2]), 0.75 - origin_m)]
+    )
+    assert len(shown[2]) > 1
+    # The world frame of KITTI is the frame of the first sweep, 2 m above the floor.
+    assert shown[3] + view.origin == pytest.approx(expected, abs=0.02)
