@@ -15,6 +15,7 @@ from distributed import Client, Future, wait
 from .errors import PipeFailed, PoolError
 from .membership import request_capacity
 from .pipe import Pipe, take_items
+from .setups import FunctionWithSetup, StageSetup
 from .worker_wait import WorkerWait, check_wait_s
 
 CHECK_S = 5.0  # interval between requests for the number of slots
@@ -104,6 +105,7 @@ class ItemTasks:
         window: int | None,
         options: dict[str, Any],
         empty_s: float,
+        setup: StageSetup | None = None,
     ) -> None:
         check_wait_s(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
@@ -113,7 +115,8 @@ class ItemTasks:
         self._count = 0  # number of items for which a task was submitted
         self._partition = partition
         self._items = _items_of(source, partition.name)
-        self._function = function
+        self._function = function if setup is None else FunctionWithSetup(function, setup)
+        self._setup = setup
         self._given_window = window
         self._options = options  # for `Partition.submit`, including arguments of the function
         # {task key: (future, index of the item, item)}
@@ -133,6 +136,8 @@ class ItemTasks:
         fails with the error, and the error is raised.
         """
         try:
+            if self._setup is not None:
+                self._setup.begin(self._partition.client)
             while self._running or not self._items.drained:
                 self._update_slots()
                 free = max(0, self._window - len(self._running))
@@ -153,6 +158,9 @@ class ItemTasks:
             reason = f"Function {funcname(self._function)!r} failed: {error!r}"
             self._items.fail(str(error) if isinstance(error, PoolError) else reason)
             raise
+        finally:
+            if self._setup is not None:
+                self._setup.end(self._partition.client)
         return self._count
 
     def stop(self) -> None:

@@ -32,6 +32,7 @@ from .errors import PoolError, TaskTimeoutError
 from .internals.client import call_when_done, gather, lend_slots
 from .map_lead import LeadTime
 from .membership import PartitionCapacity, request_capacity
+from .setups import StageSetup
 from .worker_wait import WAIT_S, WorkerWait, check_wait_s
 
 logger = logging.getLogger(__name__)
@@ -84,6 +85,7 @@ def run_chunk(
     patience_s: float,
     result_position: int,
     return_exceptions: bool,
+    setup: StageSetup | None = None,
 ) -> ChunkResult:
     """Call a function for each item of a chunk. Runs on a worker.
 
@@ -108,7 +110,22 @@ def run_chunk(
         Position of the previous result among the arguments.
     return_exceptions
         Whether to return the error of an item as its result.
+    setup
+        Setup of the stage, whose value is passed to the function before all other arguments. An
+        error of the setup function makes the task fail, because no item is the cause.
     """
+    if setup is not None:
+        with setup.value() as value:
+            return run_chunk(
+                partial(function, value),
+                first,
+                calls,
+                keywords,
+                previous,
+                patience_s=patience_s,
+                result_position=result_position,
+                return_exceptions=return_exceptions,
+            )
     start = time.perf_counter()
     results: list[Any] = []
     if previous is not None:
@@ -225,6 +242,7 @@ class Stage:
     by_rule: str = ""  # see `Partition`
     empty_s: float = WAIT_S  # maximum time to wait without workers
     annotations: dict[str, Any] = field(default_factory=dict)  # of the tasks
+    setup: StageSetup | None = None
 
     def __post_init__(self) -> None:
         for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
@@ -270,6 +288,7 @@ class Stage:
                     patience_s=patience_s,
                     result_position=self.result_position,
                     return_exceptions=keep_errors,
+                    setup=self.setup,
                 ),
                 firsts,
                 calls,
@@ -302,6 +321,7 @@ class Results(Iterator[Any]):
 
     def __init__(self, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
         self.done = 0
+        self._stages: tuple[Stage, ...] = (stage,)
         lengths = [_length(iterable) for iterable in iterables]
         self._length = math.inf if math.inf in lengths else min(lengths, default=0)
         self._closed = False
@@ -319,6 +339,8 @@ class Results(Iterator[Any]):
         self._next_item = 0  # index of the next item to deliver if the map is ordered
         self._ready: deque[Any] = deque()  # results to deliver
         self._failed: tuple[Chunk, Future] | None = None  # raised after the results in `_ready`
+        if stage.setup is not None:
+            stage.setup.begin(stage.client)
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
         # A second map is an ordinary iterable, because its chunks have different items.
         previous = iterables[maps[0]] if maps else None
@@ -326,7 +348,6 @@ class Results(Iterator[Any]):
             other_iterables = [i for i in iterables if i is not previous]
             self._continue_map(previous, replace(stage, result_position=maps[0]), other_iterables)
         else:
-            self._stages: tuple[Stage, ...] = (stage,)
             self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
             self._waits = [_worker_wait(stage)]
             self._update_slots()
@@ -394,6 +415,7 @@ class Results(Iterator[Any]):
 
     def close(self) -> None:
         """Cancel pending tasks, and discard unread results."""
+        setups = [] if self._closed else [stage.setup for stage in self._stages if stage.setup]
         self._closed = True
         self._failed = None
         for held in (self._ready, self._undelivered, self._unfinished):
@@ -402,6 +424,8 @@ class Results(Iterator[Any]):
         for future in self._running:
             future.release()
         self._running.clear()
+        for setup in setups:
+            setup.end(self._stages[-1].client)
 
     def __del__(self) -> None:
         if not getattr(self, "_closed", True):

@@ -40,6 +40,7 @@ from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .pipe_states import USES_PIPES
 from .rules import check_count, check_name
+from .setups import StageSetup
 from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
 from .task_table import TaskTable, to_datetime
@@ -76,8 +77,8 @@ class Partition:
     lists the existing partitions. The task waits until a worker with the resource joins.
 
     Dask pickles the functions of a script with each task, and creates the global variables that
-    they use anew each time. Store values that are expensive to build in a module, or as an
-    attribute of ``distributed.get_worker()``.
+    they use anew each time. Pass a function that creates an expensive value as `setup` of `map` or
+    `for_each`, or store the value in a module or as an attribute of ``distributed.get_worker()``.
 
     A partition can be passed to a task as an argument. In the task, it uses the client of the
     worker.
@@ -328,6 +329,7 @@ class Partition:
         return_exceptions: bool = False,
         empty_s: float = WAIT_S,
         timeout_s: float | None = None,
+        setup: Callable[[], Any] | None = None,
         **kwargs: Any,
     ) -> Results:
         """Call a function for each item, and return an iterator over the results.
@@ -376,6 +378,15 @@ class Partition:
         timeout_s
             Maximum running time of each item in seconds, as in `submit`. Each task then has one
             item, as with ``chunk=1``.
+        setup
+            Function without arguments, such as a function that loads a model. It is called once in
+            each worker process, when the process runs the first task of the map, and `function`
+            receives its result as the first argument, before the items. If a worker has several
+            slots, its tasks use the same object at the same time. The process keeps the object
+            until the map ends or is closed, or until the client disconnects. If Dask pauses the
+            worker because of its memory usage, the object is released while no task uses it, and
+            created again for the next task. An error of `setup` ends the map, unless `retries` are
+            left.
         kwargs
             Keyword arguments that are passed to each call. Use `functools.partial` for arguments
             that have the name of an option. Scatter large arguments and pass the futures.
@@ -398,13 +409,16 @@ class Partition:
             If `window`, `chunk` or `slots` is below 1, if `retries` or `empty_s` is below 0, if
             `timeout_s` is not positive, or if it is combined with a `chunk` above 1.
         PoolError
-            If the partition was dissolved, if the function is a coroutine function, or if `pure` or
-            `resources` is passed.
+            If the partition was dissolved, if `function` or `setup` is a coroutine function, or if
+            `pure` or `resources` is passed.
 
         Examples
         --------
         >>> sum(io.map(abs, range(-9, 0)))                               # doctest: +SKIP
         45
+        >>> def detect(model, image):                                    # doctest: +SKIP
+        ...     return model(image)
+        >>> boxes = list(gpu.map(detect, images, setup=load_model))      # doctest: +SKIP
         """
         require_feature(MAP)
         _check_function(self.name, function)
@@ -430,6 +444,7 @@ class Partition:
             by_rule=self.by_rule,
             empty_s=empty_s,
             annotations=timeout_annotation(timeout_s),
+            setup=StageSetup.from_user_value(setup),
         )
         return Results(stage, iterables)
 
@@ -468,6 +483,7 @@ class Partition:
         slots: int = 1,
         empty_s: float = WAIT_S,
         timeout_s: float | None = None,
+        setup: Callable[[], Any] | None = None,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
         """Run a task for each item of a pipe or iterable.
@@ -498,6 +514,9 @@ class Partition:
             Options of each task, as in `submit`.
         empty_s
             Maximum time in seconds that tasks wait while the partition has no workers, as in `map`.
+        setup
+            Function without arguments that is called once in each worker process. The function
+            receives its result as the first argument, before the item, as in `map`.
         kwargs
             Keyword arguments that are passed to each call. Use `functools.partial` for arguments
             that have the name of an option.
@@ -536,7 +555,9 @@ class Partition:
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._resources_for(slots)
-        tasks = ItemTasks(self, items, function, window, options, empty_s)
+        tasks = ItemTasks(
+            self, items, function, window, options, empty_s, StageSetup.from_user_value(setup)
+        )
         return tasks.run() if wait else run_in_background(tasks.run, tasks.stop)
 
     def cancel(
@@ -929,6 +950,7 @@ _BOUND = " To pass an argument of this name to the function, use `functools.part
 _OF_TASKS = {
     "resources": _SLOTS_INSTEAD + _BOUND,
     "pure": "Each call runs separately, unless calls have the same `key`." + _BOUND,
+    "setup": "Use `map` or `for_each`, which call `setup` once in each worker process." + _BOUND,
 }
 _OF_MAPS = {
     "resources": _SLOTS_INSTEAD + _BOUND,
