@@ -159,6 +159,7 @@ def without_poses(drive, rows=None):
     return Recording("drive", len(opened), read)
 
 
+@pytest.mark.extended
 def test_a_twin_has_the_ranges_of_held_out_sweeps(place):
     held = place.figures["held_out"]["stationary"]
     assert held["median_abs_difference_m"] < 0.01
@@ -167,6 +168,7 @@ def test_a_twin_has_the_ranges_of_held_out_sweeps(place):
     assert "12 sweeps" in repr(place)
 
 
+@pytest.mark.extended
 def test_a_twin_has_the_points_and_the_lost_pulses_of_held_out_sweeps(place):
     held = place.figures["held_out"]
     assert held["points"] == pytest.approx(1, abs=0.03)
@@ -176,6 +178,7 @@ def test_a_twin_has_the_points_and_the_lost_pulses_of_held_out_sweeps(place):
     assert "points    " in repr(place)
 
 
+@pytest.mark.extended
 def test_a_twin_has_the_metrics_of_lidar4d(place):
     found = place.figures["lidar4d"]
     held = place.figures["held_out"]
@@ -268,6 +271,7 @@ def test_rings_start_where_their_first_pulses_are():
     assert wrong.max() < 8.1 / 360
 
 
+@pytest.mark.extended
 def test_what_moved_is_no_part_of_the_place(place):
     middles = place.scene.vertices[place.scene.faces].mean(axis=1)
     in_lane = np.abs(middles[:, 1] - CAR_Y) < CAR[1] / 2 + 0.1
@@ -277,6 +281,7 @@ def test_what_moved_is_no_part_of_the_place(place):
     assert place.figures["moved"] > 0
 
 
+@pytest.mark.extended
 def test_moving_objects_are_simulated_in_held_out_sweeps(place):
     moving = place.figures["held_out"]["moving"]
     assert moving["rays"] > 500
@@ -288,6 +293,7 @@ def test_moving_objects_are_simulated_in_held_out_sweeps(place):
     assert place.figures["vehicle_share"] == 0, "a car that passes at close range moves"
 
 
+@pytest.mark.extended
 def test_surfaces_are_as_bright_as_they_were(place):
     scene = place.scene
     middles = scene.vertices[scene.faces].mean(axis=1)

@@ -185,6 +185,7 @@ def test_a_map_on_this_machine_imports_no_dask():
     assert done.stdout == "False\n"
 
 
+@pytest.mark.extended(every=6)
 @pytest.mark.parametrize(
     "module",
     [
