@@ -22,7 +22,7 @@ from ...environment.extras import install_command
 from ...errors import LidarError
 from ...numerics.arrays import Floats
 from ...numerics.elementary import sin_cos
-from ...numerics.vectors import rotate
+from ...numerics.vectors import hypot, rotate
 from ...schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
@@ -600,8 +600,8 @@ def includes_offset(place: Floats, offset: Floats) -> bool:
 
     `place` (2,) and `offset` (2,) are in meters. Local coordinates are close to zero.
     """
-    distance_m = float(np.hypot(*offset))
-    return distance_m > _FAR_M and float(np.hypot(*(place - offset))) < _SAME_SHARE * distance_m
+    distance_m = float(hypot(*offset))
+    return distance_m > _FAR_M and float(hypot(*(place - offset))) < _SAME_SHARE * distance_m
 
 
 def world_advice(x: float, y: float, z: float) -> str:
