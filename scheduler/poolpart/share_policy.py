@@ -78,7 +78,7 @@ class StartedTask:
 
 @dataclass(slots=True)
 class ClientAccount:
-    """What a client has used, and what it is charged."""
+    """Slot time that a client has used, and the time that it is charged."""
 
     weight: float = 1.0
     tag: float = 0.0
@@ -150,7 +150,7 @@ class SharePolicy:
         return account
 
     def remove_idle(self, present: Collection[str], now: float) -> None:
-        """Forget idle clients that are not present, unless their tag still delays them."""
+        """Remove idle clients that have disconnected and whose tag no longer delays them."""
         lowest = self._virtual_time(now)
         for client, account in list(self.accounts.items()):
             if client not in present and not account.is_active and account.tag <= lowest:

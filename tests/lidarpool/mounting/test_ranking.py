@@ -1,4 +1,4 @@
-"""Placements, metrics and the search of mounts, each with values computed by hand."""
+"""Tests of mount placements, metrics and the search, with values computed by hand."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.versions import software
 from ..work.mapping import MapFunction, parallel_map
+from ..work.work import fingerprint_files
 from .rewriting.data_set_copy import check_target
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
@@ -269,17 +270,6 @@ class Augmentation:
             ),
             "version of lidarpool": software()["lidarpool"],
         }
-
-
-def fingerprint_files(path: Path) -> str:
-    """Return a hash of the names, sizes and modification times of a file or of all in a folder."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    states = [
-        (str(file.relative_to(path)), status.st_size, status.st_mtime_ns)
-        for file in files
-        if file.is_file() and (status := file.stat())
-    ]
-    return fingerprint(states)
 
 
 @dataclass(eq=False)

@@ -37,7 +37,7 @@ _QUANTITIES = (_CLASS, *_INTENSITIES, COLORS, NORMALS, ORIGINS)  # standard name
 
 
 class PlacedPoints(NamedTuple):
-    """Points in true meters, with the coordinate system in which they are.
+    """Points in true meters, and their coordinate system.
 
     Attributes
     ----------

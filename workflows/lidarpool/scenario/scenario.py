@@ -540,7 +540,7 @@ def _stated_fields(section: Any) -> Iterator[tuple[str, Any]]:
 def _plain_data(value: Any, relative: Callable[[str], str]) -> Any:
     """Convert the value of a field to the types of YAML.
 
-    `relative` converts the names of files.
+    `relative` converts file names.
     """
     if is_section(type(value)):
         return {

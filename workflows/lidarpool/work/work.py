@@ -71,7 +71,7 @@ def fingerprint_files(path: Path) -> str:
 
 
 class Step(NamedTuple):
-    """A step of a command, which is applied to items.
+    """A processing step that a command applies to each item.
 
     Attributes
     ----------

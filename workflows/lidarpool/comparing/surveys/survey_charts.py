@@ -201,7 +201,7 @@ def _name_axes(axes: Axes, *, with_north: bool) -> None:
 
 
 class _Facade(NamedTuple):
-    """Deviations of surfaces that face the same horizontal direction."""
+    """Deviations on surfaces that face the same horizontal direction."""
 
     name: str  # direction, such as "southwest"
     positions: Floats  # (k, 2): distance from the left end and height, in meters
