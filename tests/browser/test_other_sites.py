@@ -7,6 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 from tests.spirals import WET, spiral, spiral_view
 
+from lidarpool.playback.services import service_of
 from lidarsim import load_sensor
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
@@ -77,7 +78,7 @@ def live_sensor(model):
     encoder = encoder_of(PacketSource(load_sensor(model), "strongest", "roof"))
     asked = []
     destination = Destination("127.0.0.1", {port: port for port in encoder.ports.values()})
-    with encoder.service("127.0.0.1:0", destination, asked.append) as service:
+    with service_of(encoder, "127.0.0.1:0", destination, asked.append) as service:
         yield service.port, asked
 
 

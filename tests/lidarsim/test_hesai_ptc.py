@@ -9,6 +9,7 @@ import struct
 import pytest
 
 from lidarpool import LidarError, load_sensor
+from lidarpool.playback.services import service_of
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
 
@@ -22,7 +23,7 @@ def serving(model="xt32", mode="dual", redirected=None):
     encoder = encoder_of(PacketSource(load_sensor(f"hesai/{model}"), mode, "roof"))
     destination = Destination("127.0.0.1", {2368: 40_000})
     send_to = (redirected if redirected is not None else []).append
-    with encoder.service("127.0.0.1:0", destination, send_to) as service:
+    with service_of(encoder, "127.0.0.1:0", destination, send_to) as service:
         yield encoder, int(service.description.rpartition(":")[2])
 
 
@@ -129,12 +130,14 @@ def test_peers_that_send_other_bytes_do_not_stop_the_service(asked):
 
 def test_an_address_in_use_is_refused_and_a_default_port_replaced():
     with serving() as (encoder, port):
-        service = encoder.service(f"127.0.0.1:{port}", Destination("127.0.0.1", {}), print)
+        service = service_of(encoder, f"127.0.0.1:{port}", Destination("127.0.0.1", {}), print)
         with pytest.raises(LidarError, match=f"cannot listen at 127.0.0.1:{port} .*--api"):
             service.__enter__()
         with contextlib.ExitStack() as stack:
             services = [
-                stack.enter_context(encoder.service("127.0.0.1", Destination("127.0.0.1"), print))
+                stack.enter_context(
+                    service_of(encoder, "127.0.0.1", Destination("127.0.0.1"), print)
+                )
                 for _ in range(2)
             ]
             ports = {service.description.rpartition(":")[2] for service in services}

@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 import pytest
 
+from lidarpool.playback.services import service_of
 from lidarsim import LidarError, load_sensor
 from lidarsim.packets import http_service
 from lidarsim.packets.encoders import PacketSource, encoder_of
@@ -27,7 +28,7 @@ def interface(model, mode="strongest", address="127.0.0.1:0"):
     encoder = encoder_of(PacketSource(load_sensor(model), mode, "roof"))
     asked = []
     destination = Destination("127.0.0.1", {port: port for port in encoder.ports.values()})
-    with encoder.service(address, destination, asked.append) as service:
+    with service_of(encoder, address, destination, asked.append) as service:
         yield service, asked
 
 

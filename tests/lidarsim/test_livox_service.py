@@ -14,6 +14,7 @@ import pytest
 from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_shots
 
 from lidarpool import LidarError, load_sensor
+from lidarpool.playback.services import service_of
 from lidarpool.playback.transmitter import sensor_streams
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.send import Sender
@@ -111,7 +112,7 @@ def live(model="mid360", **options):
     destination = Destination(HOST, {56_301: 56_301, 56_401: 56_401})
     with (
         sensor.client,
-        sensor.encoder.service(SENSOR, destination, sensor.destinations.append) as service,
+        service_of(sensor.encoder, SENSOR, destination, sensor.destinations.append) as service,
     ):
         sensor.service = service
         yield sensor
@@ -275,11 +276,11 @@ def test_a_flood_is_answered_in_part():
 
 def test_addresses_that_cannot_be_had_are_refused():
     with live() as sensor:
-        again = sensor.encoder.service(SENSOR, Destination("127.0.0.1"), print)
+        again = service_of(sensor.encoder, SENSOR, Destination("127.0.0.1"), print)
         with pytest.raises(LidarError, match=r":56000: .*Use a different address") as taken, again:
             pass
     assert len(str(taken.value).splitlines()) == 1
-    service = sensor.encoder.service(f"{SENSOR}:8080", Destination("127.0.0.1"), print)
+    service = service_of(sensor.encoder, f"{SENSOR}:8080", Destination("127.0.0.1"), print)
     with pytest.raises(LidarError, match="an address without a port"), service:
         pass
 

@@ -16,7 +16,9 @@ from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reach
 from lidarsim.packets.service import Destination, Service
 from lidarsim.words import did_you_mean, join_names
 
-# Returns the interface of a sensor (see `PacketEncoder.service`).
+from .services import service_of
+
+# Returns the service of a sensor, as `service_of` does.
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
 
 
@@ -92,7 +94,7 @@ def sensor_streams(
             encoder.source.name or "lidar",
             encoder.source.sensor.model,
             encoder.ports,
-            encoder.service,
+            partial(service_of, encoder),
             encoder.distinguished_by_receivers,
             encoder.has_own_address,
         )

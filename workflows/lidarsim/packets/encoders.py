@@ -139,7 +139,10 @@ class PacketEncoder(ABC):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service | None:
-        """Return the service that acts as a live sensor for the manufacturer's software, if any.
+        """Return a service that acts as a live sensor for the manufacturer's software, if any.
+
+        Encoders of plug-ins override this method. The services of the included encoders are in a
+        package above this one.
 
         `address` is the address to listen on, HOST for the usual port or HOST:PORT. The other
         parameters are the same as in `Service`.

@@ -5,7 +5,7 @@ The sources are listed in hesai_layouts.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -17,8 +17,6 @@ from ..words import did_you_mean
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .hesai_calibration import LaserTable
 from .hesai_layouts import LAYOUTS, STANDARD_STATE, UNIT_MM, HesaiPacketLayout
-from .hesai_ptc import PtcDevice, PtcService
-from .service import Destination
 from .shots import CarryOver, Shots, last_and_strongest
 
 DATA_PORT = 2368
@@ -48,17 +46,17 @@ class HesaiEncoder(PacketEncoder):
 
     def __init__(self, source: PacketSource) -> None:
         super().__init__(source)
-        self._layout = self._layout_of_model()
+        self.layout = self._layout_of_model()
         self._check_sensor()
-        layout = self._layout
+        layout = self.layout
         if source.mode not in layout.modes:
             modes = ", ".join(layout.modes)
             raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
         self._lasers = LaserTable.from_sensor(source.sensor, layout)
         self._planes = 2 if source.mode == "dual" else 1
         self._firings = layout.blocks // self._planes
-        self._port = self.port("data", DATA_PORT)
-        self._ptp = self._is_ptp()
+        self.data_port = self.port("data", DATA_PORT)
+        self.is_ptp = self._has_ptp_clock()
         self._carry = CarryOver(self._firings)
         self._next_number = 1
 
@@ -70,7 +68,7 @@ class HesaiEncoder(PacketEncoder):
         packets = self._packets(filled)
         payloads = packets.view(np.uint8).reshape(len(packets), packets.itemsize)
         last_ns = filled.starts_ns[self._firings - 1 :: self._firings]
-        datagrams = Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
+        datagrams = Datagrams(payloads, last_ns + self.firing_interval_ns, self.data_port)
         dropped = np.all(filled.dropped.reshape(-1, self._firings), axis=1)
         return [datagrams.drop(np.asarray(dropped))]
 
@@ -85,27 +83,9 @@ class HesaiEncoder(PacketEncoder):
             ".firetimes.csv": self._lasers.firetimes_file().encode(),
         }
 
-    def service(
-        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
-    ) -> PtcService:
-        """Return the service that reports the calibration and the identity of the sensor."""
-        files = self.files()
-        device = PtcDevice(
-            name=self.source.name,
-            model_code=self._layout.model_code,
-            lasers=self._layout.channels,
-            rate_rpm=self._rate_rpm,
-            mode=self.source.mode,
-            port=self._port,
-            dated=self.source.dated,
-            ptp=self._ptp,
-            calibration=files[".angles.csv"],
-            firetimes=files[".firetimes.csv"],
-        )
-        return PtcService(device, address, destination, send_to)
-
     @property
-    def _rate_rpm(self) -> int:
+    def rate_rpm(self) -> int:
+        """Rotation rate of the head in revolutions per minute."""
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
     def _layout_of_model(self) -> HesaiPacketLayout:
@@ -120,7 +100,7 @@ class HesaiEncoder(PacketEncoder):
     def _check_sensor(self) -> None:
         """Raise LidarError if the sensor does not fire like its model."""
         sensor = self.source.sensor
-        layout = self._layout
+        layout = self.layout
         head = sensor.head
         if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
             raise self.unusable("require a head that rotates clockwise")
@@ -135,22 +115,22 @@ class HesaiEncoder(PacketEncoder):
                 f"the sensor has {firing_us:.2f} µs"
             )
 
-    def _is_ptp(self) -> bool:
+    def _has_ptp_clock(self) -> bool:
         """Return whether times come from a PTP clock. Raises LidarError for an unknown clock."""
         clock = self.source.settings.identifiers.get("clock", "gps")
-        clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
+        clocks = _CLOCKS if self.layout.has_epoch_seconds else _CLOCKS[:1]
         if clock not in clocks:
             raise self.unusable(f"support the clock {' or '.join(clocks)}, not {clock}")
         return clock == "ptp"
 
     def _packets(self, shots: Shots) -> Records:
         """Encode shots as data packets, which the shots must fill completely."""
-        layout = self._layout
+        layout = self.layout
         packets = np.zeros(len(shots) // self._firings, layout.packet)
         if layout.header:
             packets["header"] = layout.header_bytes(self._planes == 2)
         self._fill_blocks(packets["blocks"], shots)
-        packets["motor_rpm"] = self._rate_rpm
+        packets["motor_rpm"] = self.rate_rpm
         packets["mode"] = layout.modes[self.source.mode]
         packets["factory"] = _FACTORY
         packets["sequence"] = self._next_number + np.arange(len(packets))
@@ -159,7 +139,7 @@ class HesaiEncoder(PacketEncoder):
         stamps_us = self._stamps_us(shots.stamps_ns[stamped :: self._firings])
         seconds = stamps_us // 1_000_000
         packets["stamp_us"] = stamps_us % 1_000_000
-        packets["date"] = _epoch_seconds(seconds) if self._ptp else layout.dates(seconds)
+        packets["date"] = _epoch_seconds(seconds) if self.is_ptp else layout.dates(seconds)
         if layout.has_checksums:
             packets["operational_state"] = STANDARD_STATE
             packets["safety"]["state"] = _NORMAL_STATE | (stamps_us // _COUNTED_US % 8)
@@ -171,13 +151,13 @@ class HesaiEncoder(PacketEncoder):
 
         `firings_ns` are the firing times of the blocks to which the timestamps belong.
         """
-        offset_us = self._layout.first_laser_us + self._layout.reference_us
+        offset_us = self.layout.first_laser_us + self.layout.reference_us
         stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
         return (stamps_ns + 500) // 1000
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
         """Write the azimuths and returns of shots to blocks."""
-        layout = self._layout
+        layout = self.layout
         units = np.rint(shots.range_m * (1000 / UNIT_MM))
         fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype("<u2")

@@ -7,7 +7,7 @@ livox_ros_driver2. All numbers are little-endian.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from zlib import crc32
 
@@ -18,7 +18,6 @@ from ..numerics.arrays import AnyArray, Bytes, Floats, Ints, Records
 from ..numerics.vectors import inverse, matmul, matvec
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, PacketImuSamples
-from .service import Destination, Service
 from .shots import CarryOver, Shots
 
 DOTS = 96  # points per packet
@@ -184,27 +183,6 @@ class LivoxEncoder(PacketEncoder):
         ports = PORTS[self.device_type]
         defaults = {"points": ports.host_points, "imu": ports.host_imu}
         return {**defaults, **self.source.settings.ports}
-
-    def service(
-        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
-    ) -> Service:
-        """Return the sensor's command interface (`PacketEncoder.service`)."""
-        from .livox_service import LivoxService, LivoxState
-
-        ports = PORTS[self.device_type]
-        state = LivoxState(
-            device_type=self.device_type,
-            product=self.source.sensor.model,
-            serial=f"LIDARPOOL{crc32(self.source.name.encode()) % 1_000_000:06d}",
-            command_port=ports.command,
-            state_ports=(ports.state, ports.host_state),
-            points_ports=(ports.points, self.ports["points"]),
-            imu_ports=(ports.imu, self.ports["imu"]),
-            data_type=int(self.data_type),
-            data_types=tuple(CARTESIAN),
-            is_synchronized=self.source.dated,
-        )
-        return LivoxService(address, destination, send_to, state, self.set_data_type)
 
     def set_data_type(self, data_type: int) -> None:
         """Set the data type of all further packets to a key of `CARTESIAN`."""

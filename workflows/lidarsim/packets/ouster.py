@@ -7,7 +7,7 @@ packet.cpp, xyzlut.cpp and metadata.cpp in ouster-sdk 1.0.1; sample recordings o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -35,7 +35,6 @@ from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, PacketImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
 from .pcap import write_datagrams
-from .service import Destination, Service
 from .shots import Shots
 
 LIDAR_PORT = 7502
@@ -359,15 +358,6 @@ class OusterEncoder(PacketEncoder):
     def files(self) -> Mapping[str, bytes]:
         """Return the metadata of the sensor as JSON, in the format of its HTTP API."""
         return {".json": (json.dumps(self.metadata(), indent=1) + "\n").encode()}
-
-    def service(
-        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
-    ) -> Service:
-        """Return the sensor's configuration interface (`PacketEncoder.service`)."""
-        from .ouster_api import OusterApi
-
-        ports = self.port("lidar", LIDAR_PORT), self.port("imu", IMU_PORT)
-        return OusterApi(address, destination, send_to, self.metadata(), ports)
 
     def _rest_of_packets(self) -> list[Datagrams]:
         """Encode the remaining columns as a packet, and discard them."""

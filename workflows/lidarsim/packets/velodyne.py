@@ -6,7 +6,7 @@ timing (63-9277); packet_decoder.cpp in valgur/velodyne_decoder.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,6 @@ from ..numerics.arrays import AnyArray, Ints
 from .capture import Capture, CapturedDatagram
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .packet_order import PacketOrder, order_notes
-from .service import Destination, Service
 from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
 
@@ -91,23 +90,6 @@ class VelodyneEncoder(PacketEncoder):
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor only sends packets whose blocks are all full."""
         return []
-
-    def service(
-        self, address: str, destination: Destination, send_to: Callable[[Destination], None]
-    ) -> Service:
-        """Return the sensor's web interface (`PacketEncoder.service`)."""
-        from .velodyne_api import VelodyneApi, VelodyneState
-
-        source = self.source
-        state = VelodyneState(
-            model=source.sensor.model,
-            serial=source.name or "lidarpool",
-            return_mode=source.mode.title(),
-            rpm=round(60 * source.sensor.head.rate_hz),  # type: ignore[attr-defined]
-            pps_state="Locked" if source.dated else "Absent",
-        )
-        ports = self.port("data", DATA_PORT), self.port("position", POSITION_PORT)
-        return VelodyneApi(address, destination, send_to, state, ports)
 
     def _data(self, shots: Shots) -> Datagrams:
         """Encode shots as data packets, which the shots must fill completely."""
