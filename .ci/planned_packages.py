@@ -34,7 +34,7 @@ PLANNED = {
         for name in (
             "clouds", "recordings", "datasets", "columns", "open3d_access", "plugins", "work",
             "identity.fingerprint", "identity.sealed", "identity.field_words", "identity.versions",
-            "processes.per_process", "processes.processors", "processes.fork_server",
+            "processes.per_process", "processes.processors", "processes.freed_memory",
         )
     },
     "lidarview.picture_file": "lidarfiles",

@@ -299,7 +299,7 @@ def augment(
     print_first_step("reading the recording", quiet=quiet)
     from ..augmentation.running import Augmentation
     from ..augmentation.sweep_tasks import RecordingFile
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

@@ -184,7 +184,7 @@ def compare(
       lidarpool compare after.e57 before.e57 --survey m3c2 --points change.laz
       lidarpool compare flight.laz --survey strips --cell 2
     """  # noqa: D301 - Click requires the character \b
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
 
     if survey != STRIPS and len(others) != 1:
         if not others:

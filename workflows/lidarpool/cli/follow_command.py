@@ -107,7 +107,7 @@ def follow(
     from ..following.opening import FollowSources, create_node
     from ..following.pose_input import is_wanted
     from ..playback.dds import Network, RosPublisher, RosSubscriber
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()

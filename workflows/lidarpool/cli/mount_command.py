@@ -72,7 +72,7 @@ def mount(
         target_files,
         write_study,
     )
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from ..scenario.mount_sections import VehicleFile
     from .terminal import Terminal

@@ -134,7 +134,7 @@ def occupancy(
     from ..clouds.folder import result_folder
     from ..occupancy.layouts import LAYOUTS
     from ..occupancy.writing import OccupancySettings, write_occupancy
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

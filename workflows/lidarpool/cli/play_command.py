@@ -112,7 +112,7 @@ def play(
     from ..playback.player import play_sweeps
     from ..playback.schedule import Schedule
     from ..playback.sources import open_source
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()

@@ -82,7 +82,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..clouds.folder import local_folder, local_result, upload
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
     from ..report.result_files import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
@@ -402,7 +402,7 @@ def fit(
     """  # noqa: D301 - Click requires the character \b
     from ..clouds.folder import check_not_existing
     from ..comparing.fit.fitting import fit as fitted
-    from ..processes.fork_server import keep_freed_memory
+    from ..processes.freed_memory import keep_freed_memory
 
     keep_freed_memory()
     if pattern:

@@ -18,7 +18,7 @@ from lidarsim.schema.checks import check_number, check_type
 from lidarsim.simulator import Scanner
 from lidarsim.words import join_names
 
-from ..processes.fork_server import keep_freed_memory
+from ..processes.freed_memory import keep_freed_memory
 from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 

@@ -7,7 +7,6 @@ fork server imports them once, while the driver continues. It then forks each wo
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import sys
@@ -19,8 +18,6 @@ from lidarsim.environment.interrupts import block_child_signals
 # Numerical libraries are limited to one thread, because workers share the cores and threads do not
 # survive a fork.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-# Values of M_TRIM_THRESHOLD (-1) and M_MMAP_THRESHOLD (-3), the options of glibc's mallopt.
-_THRESHOLDS = {-1: 256 << 20, -3: 256 << 20}
 
 
 def start_fork_server() -> bool:
@@ -46,17 +43,6 @@ def start_fork_server() -> bool:
         os.environ.clear()
         os.environ.update(environment)
     return True
-
-
-def keep_freed_memory() -> None:
-    """Make this process and its forks reuse the memory of large arrays after they are freed.
-
-    By default, glibc returns this memory to the system, and the next large array causes page
-    faults. Rendering pictures spent an eighth of its time on such page faults.
-    """
-    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # only in glibc
-        for option, size in _THRESHOLDS.items():
-            mallopt(option, size)
 
 
 def stop_fork_server() -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import cloudpickle
 
-from ..processes.fork_server import keep_freed_memory
+from ..processes.freed_memory import keep_freed_memory
 
 
 def serve(descriptor: int) -> None:

@@ -21,7 +21,7 @@ import poolpart.deploy.local  # noqa: F401
 
 from ...identity import versions
 from ...plan import trial  # noqa: F401
-from ...processes.fork_server import keep_freed_memory
+from ...processes.freed_memory import keep_freed_memory
 from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()
