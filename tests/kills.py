@@ -71,6 +71,14 @@ def killed_after(changes: int, folder: Path) -> Iterator[None]:
         _kills[0].folder = None
 
 
+def count_changes(folder: Path, call: Callable[[], object]) -> int:
+    """Call a function, and return the number of its changes on disk below a folder."""
+    most = 1 << 30
+    with killed_after(most, folder):
+        call()
+        return most - _kills[0].left
+
+
 def is_killed(changes: int, folder: Path, call: Callable[[], object]) -> bool:
     """Call a function, and return whether it was killed after the given number of changes."""
     try:

@@ -1,0 +1,187 @@
+"""Commands that are killed at any change on disk, and continued.
+
+The computing is replaced by a few values, so that each row of `USERS` takes little time.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from tests.kills import count_changes, is_killed
+from tests.recorded_drives import recorded_points, write_pcd_drive
+
+from lidarpool import twin
+from lidarpool.reconstruction import building
+from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.work import publishing
+from lidarpool.work.work import FOLDER, Step
+from lidarsim.io.storage import TEMPORARY, WRITING
+
+# Names of files and folders that are not part of a result.
+UNFINISHED = (FOLDER, TEMPORARY, WRITING)
+ORDER = ("earlier", "incomplete", "new")  # what is left after a kill, the later the more
+POSITIONS = 12  # number of kills of each command in a short test
+
+
+class Values(NamedTuple):
+    values: np.ndarray
+
+
+VALUES = Step("values", (Values,))
+TOTAL = Step("total", (Values,))
+
+
+class User:
+    """Command that stores finished items, or only moves its result into place.
+
+    A result depends on a number, its version.
+
+    Attributes
+    ----------
+    last
+        File or folder without which a result is visibly incomplete, relative to the folder that
+        contains all outputs.
+    """
+
+    last = ""
+
+    def prepare(self, folder: Path, patches: pytest.MonkeyPatch) -> None:
+        """Write the inputs to a folder, and replace the computing."""
+
+    def run(self, inputs: Path, outputs: Path, version: int, *, resume: bool = False) -> None:
+        """Write a result, or continue with one, and replace an earlier one."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class _FakeTwin:
+    total: int
+
+    def write(self, folder):
+        (folder / "actors").mkdir()
+        for number in range(self.total % 4):
+            (folder / "actors" / f"{number}.ply").write_text(f"{number} of {self.total}")
+        (folder / "page.html").write_text(f"page of {self.total}")
+        (folder / "scenario.yaml").write_text(f"twin of {self.total}")
+
+
+class TwinUser(User):
+    last = "out/scenario.yaml"
+
+    def prepare(self, folder, patches):
+        drive = write_pcd_drive(folder / "drive", recorded_points(4))
+        recorded = RecordedSweeps.open(drive)
+
+        def compute(building, track):
+            factor = round(10 * building.voxel_m)
+            items = [factor * number for number in range(3)]
+            each = building.work.each(VALUES, map, lambda item: (Values(np.array([item])),), items)
+            total = sum(int(part.values[0]) for (part,) in each)
+            (kept,) = building.work.once(TOTAL, lambda: (Values(np.array([total])),))
+            return _FakeTwin(int(kept.values[0]))
+
+        patches.setattr(building._Building, "twin", compute)
+        patches.setattr(RecordedSweeps, "open", lambda *arguments: recorded)
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        drive, out = inputs / "drive", outputs / "out"
+        twin(drive, out=out, voxel_m=0.1 * version, resume=resume, overwrite=True)
+
+
+USERS: dict[str, Callable[[], User]] = {"twin": TwinUser}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+class Kills:
+    """A command that replaces a result of version 1 with version 2, and is killed."""
+
+    def __init__(self, user: User, folder: Path) -> None:
+        self.user = user
+        self.inputs = folder / "inputs"
+        self.outputs = folder / "outputs"
+        self.before = folder / "before"
+        self.inputs.mkdir()
+        self.outputs.mkdir()
+
+    def prepare(self, patches: pytest.MonkeyPatch) -> None:
+        """Compute both versions, and leave the first beside a file of the user."""
+        self.user.prepare(self.inputs, patches)
+        self.given = files(self.inputs)
+        self.run(2)
+        (self.outputs / "mine.txt").write_text("of the user")
+        self.new = files(self.outputs)
+        shutil.rmtree(self.outputs)
+        self.outputs.mkdir()
+        self.run(1)
+        (self.outputs / "mine.txt").write_text("of the user")
+        self.earlier = files(self.outputs)
+        shutil.copytree(self.outputs, self.before)
+        self.changes = count_changes(self.outputs.parent, lambda: self.run(2))
+
+    def run(self, version: int, *, resume: bool = False) -> None:
+        self.user.run(self.inputs, self.outputs, version, resume=resume)
+
+    def kill(self, position: int) -> str:
+        """Kill the command, and return what is left, after which it is continued."""
+        shutil.rmtree(self.outputs)
+        shutil.copytree(self.before, self.outputs)
+        killed = is_killed(position, self.outputs.parent, lambda: self.run(2))
+        left = self._check()
+        # A second kill while the command is continued.
+        second = position % 7
+        is_killed(second, self.outputs.parent, lambda: self.run(2, resume=killed))
+        self._check()
+        self.run(2, resume=True)
+        assert files(self.outputs) == self.new
+        return left
+
+    def _check(self) -> str:
+        """Check that there is one whole result, or visibly none."""
+        assert files(self.inputs) == self.given
+        found = {
+            name: content
+            for name, content in files(self.outputs).items()
+            if not any(part.startswith(UNFINISHED) for part in Path(name).parts)
+        }
+        assert found["mine.txt"] == b"of the user"
+        if not (self.outputs / self.user.last).exists():
+            return "incomplete"
+        if found == self.new:
+            return "new"
+        assert found == self.earlier
+        return "earlier"
+
+
+@pytest.fixture(params=USERS)
+def kills(request, tmp_path, monkeypatch):
+    made = Kills(USERS[request.param](), tmp_path)
+    made.prepare(monkeypatch)
+    monkeypatch.setattr(publishing, "flush", lambda path: None)  # takes most of the time
+    return made
+
+
+def test_a_killed_command_leaves_one_result_or_visibly_none_and_is_continued(kills):
+    step = max(kills.changes // POSITIONS, 1)
+    left = [kills.kill(position) for position in range(0, kills.changes, step)]
+    assert left == sorted(left, key=ORDER.index)
+    assert left[0] == "earlier"
+
+
+@pytest.mark.extended
+def test_wherever_a_command_is_killed(kills):
+    left = [kills.kill(position) for position in range(kills.changes + 1)]
+    assert left == sorted(left, key=ORDER.index)
+    assert {*left} == {*ORDER}
