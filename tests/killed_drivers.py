@@ -38,7 +38,7 @@ pictures.take_shot = lambda *_, **__: None
 class BlankPage:
     def __init__(self, *_, **__): pass
     def save(self, path): path.write_bytes(b"x")
-    def svg(self): return "<svg></svg>"
+    def html(self): return "<svg></svg>"
 pictures.draw_scene = pictures.draw_hits = BlankPage
 pictures.draw_cloud = pictures.draw_path = BlankPage
 lidarpool.run.pipeline.policies.scans_per_batch = lambda *_: 10

@@ -53,6 +53,40 @@ def test_no_number_or_label_is_cut_off(new_tab, tmp_path):
                 assert tab.value("document.documentElement.scrollWidth") <= size[0]
 
 
+# What of a picture lies beside the screen, is too small to read, or covers other text.
+UNREADABLE = """(() => {
+  const found = [];
+  const wide = document.documentElement.clientWidth;
+  for (const figure of document.querySelectorAll('figure[data-picture]:not([hidden])')) {
+    const name = figure.dataset.picture;
+    if (getComputedStyle(figure).overflowX !== 'hidden') found.push(`${name} is scrolled`);
+    const shown = (e) => getComputedStyle(e).display !== 'none' && e.getBoundingClientRect();
+    const boxes = [...figure.querySelectorAll('.picture-label, .picture-key, .picture-title')]
+      .map(shown).filter(Boolean);
+    if (name !== 'above' && boxes.length < 5) found.push(`${name} has no text`);
+    for (const box of boxes) {
+      if (box.left < 0 || box.right > wide) found.push(`${name} has text beside the screen`);
+      if (Math.max(box.width, box.height) < 5) found.push(`${name} has tiny text`);
+    }
+    if ([...figure.querySelectorAll('.picture-margin')].some(shown)) found.push(`${name} twice`);
+  }
+  return found;
+})()"""
+
+
+def test_pictures_fit_the_screen_of_a_phone(new_tab, tmp_path):
+    (tmp_path / "small.yaml").write_text(SCENARIO)
+    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--pictures"]
+    subprocess.run(run, cwd=tmp_path, check=True, timeout=180, capture_output=True)
+    tab = new_tab("about:blank")
+    tab.resize(390, 844, mobile=True)
+    tab.open((tmp_path / "lidarpool-out" / "report.html").as_uri())
+    tab.wait_for(lambda text: "Some of the rays" in text)
+    assert tab.value(UNREADABLE) == []
+    tab.resize(1280, 900)
+    tab.wait_for(lambda text: "Some of the rays" not in text)  # the drawing has it
+
+
 def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):
     (tmp_path / "small.yaml").write_text(SCENARIO)
     run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--pictures"]

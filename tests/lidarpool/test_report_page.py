@@ -108,10 +108,12 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         scenario: Scenario | None = SCENARIO,
         origin: tuple[float, float, float] = (0, 0, 0),
         cloud: Cloud | None = None,
+        *,
+        epsg: int | None = None,
         **changes: Any,
     ) -> tuple[str, dict[str, Any]]:
         scene = replace(scene_of(names), origin=np.array(origin))
-        survey = Survey(Sensor.grid(layers=16), poses=[(0, 0, 1), (1, 0, 2)], steps=60)
+        survey = Survey(Sensor.grid(layers=16), poses=[(0, 0, 1), (1, 0, 2)], steps=60, epsg=epsg)
         trials = tuple(run_trial(plan, number) for number in range(plan.trials)) if plan else ()
         book = TaskBook()
         for task in tasks:
@@ -198,6 +200,20 @@ def test_the_points_are_shown_from_above(write):
     assert length == "2 m" and pixels * pixel_m == pytest.approx(2, abs=0.02)
     (key,) = page.xpath("//span[@class='key']")
     assert re.sub(" +", " ", key.text_content()) == "15.3 45.8 points per m²"  # 1 and 3 in a pixel
+
+
+@pytest.mark.parametrize(
+    ("epsg", "up", "words"), [(25832, "N", "North is up."), (None, "y", "y axis")]
+)
+def test_the_top_view_has_a_heading_and_an_arrow_up(write, epsg, up, words):
+    page = html.fromstring(write(epsg=epsg)[0])
+    (figure,) = page.xpath("//figure[@data-picture='above']")
+    assert figure.xpath("h2/text()") == ["Top view"] and words in figure.text_content()
+    assert figure.xpath(".//text[@class='up']/text()") == [up]
+    (steps,) = figure.xpath(".//path[@class='up']/@d")
+    x, bottom, tip = map(float, re.match(r"M([\d.]+) ([\d.]+)V([\d.]+)M", steps).groups())
+    (image,) = figure.xpath(".//image")
+    assert float(image.get("height")) < tip < bottom and x < float(image.get("width"))
 
 
 def test_sensors_within_the_points_are_marked_from_above(write):

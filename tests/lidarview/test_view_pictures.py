@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import re
 from dataclasses import replace
 
@@ -12,11 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import html
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
-from tests.shapes import block, quad
+from tests.shapes import block, level, quad
 
 from lidarpool import Cloud, Column, LidarError, Planning, Scene, SceneMesh, box
 from lidarpool.plan import best, run_trial
@@ -24,9 +26,11 @@ from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
+from lidarsim.words import shorten_name
 from lidarview.color_table import TURBO
 from lidarview.render.coloring import make_coloring
 from lidarview.render.hit_density import hit_density
+from lidarview.render.picture_page import Page
 from lidarview.render.pictures import draw_cloud, draw_hits, draw_points, draw_scene
 from lidarview.render.shot import GROUND, SKY, take_shot
 from lidarview.render.stage import make_axis, nice_step
@@ -468,3 +472,148 @@ def test_rays_have_a_row_in_the_legend_and_no_color_of_the_scale(scene):
         "Sensor position", "Some of the rays",
     ]  # fmt: skip
     assert np.abs(TURBO - to_rgb(SENSOR)).max(axis=1).min() > 0.2
+
+
+STREET = [
+    level("ground", 0, 100),
+    level("pavement", 0.1, 80),
+    *(block(f"box {k}", (0.4 + 0.01 * k,) * 3, (k % 5, k // 5, 0.5)) for k in range(15)),
+    block("far", (4, 4, 3), (-80, 0, 1.5)),
+]
+DRIVE = np.array([[-2.0, 0, 2], [2, 0, 2]])
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """A drive of 4 m, whose surroundings are shown: 54 by 50 m of 200 by 200 m."""
+    scene = Scene.from_meshes(STREET)
+    way = {"paths": [DRIVE], "trajectories": [DRIVE], "models": "A"}
+    return take_shot(scene, DRIVE[:1], size=SIZE, backend="numpy", **way)
+
+
+def texts(page):
+    return [text.get_text() for text in page.figure.findobj(Text)]
+
+
+def labels(page):
+    (legend,) = page.figure.legends
+    return dict(zip((t.get_text() for t in legend.get_texts()), legend.legend_handles, strict=True))
+
+
+def test_rays_of_a_drive_do_not_cover_what_was_hit_most(driven, pixels):
+    hits = np.zeros(int(driven.part.parents.max()) + 1, np.int64)
+    rays = np.array([[[0, 0, 2], [9, -9, 0.1]]], np.float32)
+    plain, drawn = (pixels(draw_hits, driven, hits, NOWHERE, some) for some in (NONE, rays))
+    assert np.array_equal(plain, drawn)
+    rows = labels(draw_hits(driven, hits, NOWHERE, rays))
+    assert {name: handle.get_marker() for name, handle in rows.items()} == {
+        "Sensor position": "o", "Sensor path": "_",
+    }  # fmt: skip
+
+
+def test_counts_say_how_much_of_them_is_in_the_part_shown(driven):
+    """Of four points one is above the part, one beside it, and one below the ground of noise."""
+    points = np.array([[1, 1, -0.01], [2, 2, 0], [3, 3, 60], [90, 0, 0.0]])
+    hits = np.zeros(int(driven.part.parents.max()) + 1, np.int64)
+    hits[0] = 8
+    cloud = Cloud(points, {})
+    assert "8 hits, 50% of them in the part shown · 1 sensor position" in texts(
+        draw_hits(driven, hits, points, NONE)
+    )
+    assert "4 points, 50% of them in the part shown · 1 sensor position" in texts(
+        draw_cloud(driven, cloud, 4)
+    )
+    lines = texts(draw_scene(driven, 9))
+    assert "18 objects, 17 of them in the part shown · 9 triangles · 1 sensor position" in lines
+    assert "part shown: 54 × 50 m around the trajectories, below z = 3 m · A" in lines
+
+
+def test_counts_of_a_whole_scene_mention_no_part(scene, shot):
+    hits = np.ones(len(scene.faces), np.int64)
+    words = f"{len(hits):,} hits · {len(POSES)} sensor positions"
+    assert words in texts(draw_hits(shot, hits, scene.vertices, NONE))
+
+
+def test_fewer_points_than_hits_are_explained_on_both_pictures(scene, shot):
+    hits = np.zeros(len(scene.faces), np.int64)
+    hits[0] = 4926
+    sensors = f"{len(POSES)} sensor positions"
+    assert f"4,926 hits · one in 5 hits of each scan is in the cloud · {sensors}" in texts(
+        draw_hits(shot, hits, NOWHERE, NONE, keep_every=5)
+    )
+    assert f"995 points · one in 5 hits of each scan · {sensors}" in texts(
+        draw_cloud(shot, Cloud(scene.vertices, {}), 995, keep_every=5)
+    )
+
+
+def test_floors_and_other_objects_are_told_apart(driven):
+    """Their colors differ by at least 0.1 in OKLab, ten times what is just noticeable."""
+    rows = labels(draw_scene(driven, 9))
+    named = ("ground", "pavement", "5 other objects", "Sensor path")
+    colors = [oklab(to_rgb(rows[name].get_color())) for name in named]
+    for a, b in itertools.combinations(colors, 2):
+        assert np.linalg.norm(a - b) > 0.1
+
+
+def oklab(color):
+    """Convert an sRGB color from 0 to 1 to OKLab (Ottosson, 2020)."""
+    srgb = np.asarray(color)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    lms = [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ] @ linear
+    return np.array([
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]) @ np.cbrt(lms)  # fmt: skip
+
+
+@pytest.mark.parametrize("clearance_m", [0.0, -0.1])
+def test_an_obstacle_is_whole_beside_a_path_without_collisions(planned, clearance_m):
+    page = draw_path(
+        planned, replace(planned.best, clearance_m=clearance_m), np.zeros(2), (1600, 1000)
+    )
+    (axes,) = page.figure.axes
+    discs = next(c for c in axes.collections if isinstance(c, PatchCollection))
+    path = next(line for line in axes.lines if len(line.get_xdata()) > 1)
+    assert (discs.zorder > path.zorder) == (clearance_m >= 0)
+
+
+LONG = "Warehouse shelf, left row"
+
+
+def test_a_long_name_has_two_lines_in_the_legend_and_is_complete():
+    scene = Scene.from_meshes([SceneMesh(LONG, *solid(0)), SceneMesh("x" * 60, *solid(1))])
+    page = draw_scene(take_shot(scene, [], size=SIZE, backend="numpy"), 9)
+    first, second = labels(page)
+    assert first == "Warehouse shelf,\nleft row"
+    assert second.replace("\n", "") == shorten_name("x" * 60, 36)
+
+
+def test_long_details_are_divided_at_their_dots():
+    page = Page((1600, 1000))
+    details = [f"{letter * 50}" for letter in "abcd"]
+    page.title("Title", " · ".join(details), "short")
+    assert texts(page)[:4] == ["Title", " · ".join(details[:2]), " · ".join(details[2:]), "short"]
+
+
+def test_title_and_legend_are_also_text_around_the_drawing(scene, shot):
+    """Text of a phone's size; what it replaces in the drawing has a class of its own."""
+    hits = np.ones(len(scene.faces), np.int64)
+    page = html.fromstring(f"<main>{draw_hits(shot, hits, NOWHERE, NONE).html()}</main>")
+    assert [child.get("class") for child in page] == ["picture-title", None, "picture-key"]
+    title, drawing, key = page
+    assert title.xpath("h2/text()") == ["Hits"]
+    assert title.xpath("p/text()") == [f"{len(hits):,} hits · {len(POSES)} sensor positions"]
+    scale, entries = key
+    assert scale.xpath("p/text()")[0].startswith("hits per square meter (gray: fewer than ")
+    low, middle, high = (float(text.replace(",", "")) for text in scale.xpath("span/text()"))
+    assert middle == pytest.approx(np.sqrt(low * high), rel=0.02)  # the scale is logarithmic
+    assert entries.xpath("li/i/@class") == ["dot", "line"]
+    assert entries.xpath("li/text()") == ["Sensor positions", "Some of the rays"]
+    classes = [element.get("class") for element in drawing.iter("g") if element.get("class")]
+    assert classes.count("picture-margin") == 4  # title, details, color bar and legend
+    assert classes.count("picture-label") >= 9  # three axes

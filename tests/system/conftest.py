@@ -234,7 +234,7 @@ class BlankPage:
     def save(self, path: Path) -> None:
         path.write_bytes(b"x")
 
-    def svg(self) -> str:
+    def html(self) -> str:
         return "<svg></svg>"
 
 

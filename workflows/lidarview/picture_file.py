@@ -130,6 +130,7 @@ class PictureContent:
     face_materials: Ints32 | None = None  # (f,) material of each static triangle, -1 for none
     # (objects,) class of each object, with actors last; None if unknown. The first class counts.
     object_classes: NDArray[np.uint16] | None = None
+    keep_every: int = 1  # the cloud contains one of this many hits of a scan
 
     @classmethod
     def before_casting(
@@ -164,6 +165,7 @@ class PictureContent:
             materials=scene.material_names,
             face_materials=drawn.scene.face_materials,
             object_classes=materials.semantic_class[kinds.first[:-1]],
+            keep_every=survey.keep_every,
         )
         return content, drawn
 
@@ -228,6 +230,7 @@ class PictureContent:
             "triangles": self.triangles,
             **({"classes": self.classes} if self.classes else {}),
             **({"materials": self.materials} if self.materials else {}),
+            **({"keep_every": self.keep_every} if self.keep_every > 1 else {}),
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -379,6 +382,7 @@ class PictureContent:
             materials=names.get("materials"),
             face_materials=arrays.get("face_materials"),
             object_classes=arrays.get("object_classes"),
+            keep_every=names.get("keep_every", 1),
         )
 
 

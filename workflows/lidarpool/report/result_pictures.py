@@ -28,7 +28,7 @@ from lidarsim.words import did_you_mean, join_alternatives, plural
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.coloring import add_composed_columns
-from lidarview.render.picture_page import DPI, FONT, Page
+from lidarview.render.picture_page import DPI, FONT, LEFT_LABEL, RIGHT_LABEL, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
@@ -42,7 +42,7 @@ _LIGHT = ("reflectance", "intensity")  # columns for the intensity picture, in o
 MAX_RATIO = 2  # maximum aspect ratio for which legends fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width and height of the plot on the page
 MAX_TRIALS = 1000
-_BEST_WIDTH = 2.0  # line width of the best path, points
+_BEST_WIDTH = 1.4  # line width of the best path, points
 PATH_COLOR = "#d6336c"
 TRIAL_COLOR = "#5b8fd0"
 # HIDDEN surfaces are not visible from any candidate, and OTHER surfaces are not targets.
@@ -123,7 +123,7 @@ def draw_pictures(
         picture = makers[name]()
         picture.save(path)
         if page.exists():
-            insert_picture(page, name, picture.svg())
+            insert_picture(page, name, picture.html())
         yield path
     show("pictures", len(names), len(names), "pictures")
 
@@ -161,7 +161,7 @@ def _picture_makers(
 
     def draw_counts() -> Page:
         hit_points = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
-        return draw_hits(shot(), shown.hit_counts, hit_points, shown.sample_rays)
+        return draw_hits(shot(), shown.hit_counts, hit_points, shown.sample_rays, shown.keep_every)
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.extra_columns)
@@ -176,7 +176,14 @@ def _picture_makers(
                 f"{did_you_mean(color, columns_by_name) or available}"
             )
         column = columns_by_name[color]
-        return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
+        return draw_cloud(
+            shot(),
+            points(),
+            len(file),
+            column,
+            shown.names_of(column),
+            keep_every=shown.keep_every,
+        )
 
     makers: dict[str, Callable[[], Page]] = {
         "scene": lambda: draw_scene(shot(), shown.triangles),
@@ -186,7 +193,12 @@ def _picture_makers(
         light = next((TABLE[name] for name in _LIGHT if name in columns), None)
         if light is not None:
             makers["intensity"] = lambda: draw_cloud(
-                shot(), points(), len(CloudFile(cloud)), light, solid=True
+                shot(),
+                points(),
+                len(CloudFile(cloud)),
+                light,
+                solid=True,
+                keep_every=shown.keep_every,
             )
         makers["cloud"] = draw_points
     planning = shown.planning
@@ -228,11 +240,14 @@ def draw_path(
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # line width of the best path
     drawn_trials = [trial for trial in drawn_trials if max_deviation(trial, best) > width_m]
     circles = zip(planning.centers, planning.radii, strict=True)
+    # A shortest path touches obstacles. Its line is wider than the path, so the obstacles are drawn
+    # over it, unless the path itself enters one of them.
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
         facecolor=theme.UNSEEN,
         edgecolor=theme.MUTED,
         linewidth=0.6 * unit,
+        zorder=5 if path.clearance_m >= 0 else 1,
     )
     axes.add_collection(discs)
     alpha = float(np.clip(6 / max(len(drawn_trials), 1), 0.08, 0.6))
@@ -240,7 +255,7 @@ def draw_path(
         LineCollection(drawn_trials, colors=TRIAL_COLOR, linewidths=0.8 * unit, alpha=alpha)
     )
     axes.plot(*best.T, color=PATH_COLOR, lw=_BEST_WIDTH * unit, solid_joinstyle="round", zorder=4)
-    axes.plot(*best[1:-1].T, "o", color=PATH_COLOR, ms=2.6 * unit, zorder=5)
+    axes.plot(*best[1:-1].T, "o", color=PATH_COLOR, ms=2.2 * unit, zorder=4)
     _draw_ends(axes, page, planning)
     page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
     page.title("Planned path", _path_caption(path, trials))
@@ -351,6 +366,7 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
             family=FONT,
             path_effects=halo,
             zorder=7,
+            gid=LEFT_LABEL if is_right else RIGHT_LABEL,
         )
 
 

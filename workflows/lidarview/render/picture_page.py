@@ -5,27 +5,30 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from markupsafe import escape
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize, to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyFloats, Floats
-from lidarsim.words import shorten_name
+from lidarsim.words import format_rounded, shorten_name
 
 from . import theme
 from .shot import SurfaceView
@@ -43,6 +46,8 @@ MAX_NAMES = 12  # actors are not named if there are more
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
 LEGEND_ROWS = 30
+LEGEND_LETTERS = 18  # maximum length of a line in the legend; longer names have two lines
+DETAIL_LETTERS = 140  # maximum length of a line below the title; longer ones are divided
 TICK = 7.0  # length of a tick mark
 # Distances from an edge to the tick labels beside it and below it.
 LABEL_MARGIN_X = 14.0
@@ -51,6 +56,13 @@ LETTER_WIDTH = 12.0  # width of a digit
 TITLE_DISTANCE = 32.0  # distance between the tick labels and the title
 LABEL_SPACING = 34.0  # minimum distance between tick labels
 MIN_AXIS = 36.0  # a shorter height axis has no tick labels
+# Classes of SVG groups, for the style sheet of an HTML page: labels in the plot, of which some are
+# to the right or left of a marker, and the title and legends around the plot.
+LABEL = "picture-label"
+RIGHT_LABEL = "picture-label-right"
+LEFT_LABEL = "picture-label-left"
+_MARGIN = "picture-margin"
+_GRADIENT_STEPS = 16  # colors that represent a color scale in HTML
 
 
 class Page:
@@ -63,6 +75,8 @@ class Page:
         self.size = size
         self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.PAGE)
         self.unit = size[0] / 1600  # fonts and lines scale with the picture
+        self._headline = ""  # title and details as HTML
+        self._keys: list[str] = []  # legends and color scales as HTML
 
     def draw_view(self, shot: SurfaceView, image: AnyFloats) -> Axes:
         """Draw a colored view with grid, axes, sensors, and actor names.
@@ -135,7 +149,8 @@ class Page:
         color: str,
         **options: Any,
     ) -> None:
-        style = {"ha": "center", "va": "center", "color": color, "family": FONT} | options
+        style: dict[str, Any] = {"ha": "center", "va": "center", "color": color, "family": FONT}
+        style |= {"gid": LABEL} | options
         text_artist = parent.text(
             float(position[0]), float(position[1]), text, fontsize=size * self.unit, **style
         )
@@ -316,16 +331,25 @@ class Page:
             ticks = make_axis(name, lower, upper, step, float(start))
             side.set_ticks(ticks.ticks, ticks.labels)
             side.set_label_text(ticks.title)
+            for label in (side.label, *side.get_ticklabels()):
+                label.set_gid(LABEL)
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, with details in the lines below."""
+        """Write a title at the top left, with details in the lines below.
+
+        Long details are divided at their centered dots.
+        """
         line = 0.05 * self.size[0] / self.size[1] / 1.6
         position = 0.03, 1 - line
-        self._text(self.figure, position, text, 11, theme.INK, ha="left", weight="bold")
-        for number, detail in enumerate(details):
+        style = {"ha": "left", "gid": _MARGIN}
+        self._text(self.figure, position, text, 11, theme.INK, weight="bold", **style)
+        rows = [row for detail in details for row in _divide_detail(detail)]
+        for number, row in enumerate(rows):
             position = 0.03, 1 - (1.84 + 0.62 * number) * line
-            self._text(self.figure, position, detail, 7.2, theme.MUTED, ha="left")
+            self._text(self.figure, position, row, 7.2, theme.MUTED, **style)
+        self._headline = f"<h2>{escape(text)}</h2>"
+        self._headline += "".join(f"<p>{escape(detail)}</p>" for detail in details if detail)
 
     def draw_note(self, text: str) -> None:
         """Write a line at the bottom left."""
@@ -344,21 +368,20 @@ class Page:
         self,
         entries: Sequence[tuple[str, Any]],
         sensor: str = "Sensor",
-        rays: str = "",
+        lines: Sequence[str] = (),
         **options: Any,
     ) -> None:
         """Draw a legend in the right margin.
 
         `entries` contains tuples (name, color). If there are more than `LEGEND_ROWS`, the last line
-        states the number of omitted entries. `sensor` and `rays` are the labels of the sensor
-        marker and of the rays, which are omitted if their labels are empty. The options are passed
-        to `key`.
+        states the number of omitted entries. `sensor` is the label of the sensor marker, which is
+        omitted if the label is empty. `lines` contains the labels of lines in the color of the
+        sensors. The options are passed to `key`.
         """
         rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:
             rows.append(("o", sensor, theme.SENSOR))
-        if rays:
-            rows.append(("_", rays, theme.SENSOR))
+        rows += [("_", line, theme.SENSOR) for line in lines]
         if len(entries) > LEGEND_ROWS:
             rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
         size = min(7.4, 175 / len(rows))
@@ -373,7 +396,7 @@ class Page:
                     ms=(1.6 if marker == "_" else 0.85) * size * self.unit,
                     mec=color if marker == "_" else "none",
                     mew=0.8 * self.unit,
-                    label=shorten_name(name),
+                    label=shorten_name(name, 2 * LEGEND_LETTERS),
                 )
                 for marker, name, color in rows
             ],
@@ -390,7 +413,7 @@ class Page:
     ) -> None:
         """Draw a legend of Matplotlib handles in the right margin or on a parent.
 
-        `size` is the font size in points.
+        `size` is the font size in points. Long labels in the right margin have two lines.
         """
         style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
@@ -405,9 +428,17 @@ class Page:
         )
         # Names come from files. Matplotlib would omit names that start with an underscore, and
         # fail on names that look like a formula ("$\\frac{x$").
-        for text, handle in zip(legend.get_texts(), handles, strict=True):
+        labels = [str(handle.get_label()) for handle in handles]
+        for text, label in zip(legend.get_texts(), labels, strict=True):
             text.set_parse_math(False)
-            text.set_text(str(handle.get_label()))
+            text.set_text(label if parent else _divide_name(label))
+        if parent is None:
+            legend.set_gid(_MARGIN)
+            rows = (
+                f"<li>{_swatch(handle)}{escape(label)}</li>"
+                for handle, label in zip(handles, labels, strict=True)
+            )
+            self._keys.append(f"<ul>{''.join(rows)}</ul>")
 
     def color_bar(
         self,
@@ -417,7 +448,8 @@ class Page:
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> Axes:
         """Draw a color bar with a title in the right margin, and return its axes."""
-        axes = self.figure.add_axes(frame)
+        axes = self.figure.add_axes(frame, gid=_MARGIN)
+        self._keys.append(_html_scale(colors, norm, title))
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
         bar.set_label(
@@ -476,9 +508,72 @@ class Page:
         svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
         svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
         svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
-        for color, name in theme.STYLED.items():
-            svg = svg.replace(color, f"var(--picture-{name}, {color})")
-        return svg
+        svg = re.sub(r' id="(picture-[a-z-]+)"', r' class="\1"', svg)
+        return _use_page_colors(svg)
+
+    def html(self) -> str:
+        """Return the page as elements of an HTML document: the title, the drawing and the legend.
+
+        The title and the legend are also in the drawing. A style sheet shows either these, or on
+        small screens the elements around the drawing, whose text is as large as that of the page.
+        """
+        keys = _use_page_colors("".join(self._keys))
+        return (
+            f'<div class="picture-title">{self._headline}</div>{self.svg()}'
+            f'<div class="picture-key">{keys}</div>'
+        )
+
+
+def _use_page_colors(elements: str) -> str:
+    """Replace the colors in `theme.STYLED` by CSS variables."""
+    for color, name in theme.STYLED.items():
+        elements = elements.replace(color, f"var(--picture-{name}, {color})")
+    return elements
+
+
+def _divide_detail(detail: str) -> list[str]:
+    """Divide a line below the title at its centered dots if it is too long."""
+    rows = [""]
+    for part in detail.split(" · "):
+        joined = f"{rows[-1]} · {part}".removeprefix(" · ")
+        if len(joined) > DETAIL_LETTERS and rows[-1]:
+            rows.append(part)
+        else:
+            rows[-1] = joined
+    return rows
+
+
+def _divide_name(name: str) -> str:
+    """Divide a name for the legend into two lines if it is long."""
+    if len(name) <= LEGEND_LETTERS:
+        return name
+    lines = textwrap.wrap(name, LEGEND_LETTERS, drop_whitespace=False)
+    if len(lines) > 2:  # the spaces are in inconvenient places
+        lines = [name[:LEGEND_LETTERS], name[LEGEND_LETTERS:]]
+    return "\n".join(line.strip() for line in lines)
+
+
+def _swatch(handle: Artist) -> str:
+    """Return the marker of a legend entry as HTML."""
+    if isinstance(handle, Line2D):
+        shape = {"s": "", "o": "dot", "": "none"}.get(str(handle.get_marker()), "line")
+        color = handle.get_color()
+    else:
+        shape = ""
+        color = handle.get_facecolor() if isinstance(handle, Patch) else theme.INK
+    return f'<i class="{shape}" style="background: {to_hex(color)}"></i>'
+
+
+def _html_scale(colors: Floats, norm: Normalize, title: str) -> str:
+    """Return a color scale as HTML, with the values at its ends and in the middle."""
+    chosen = colors[np.linspace(0, len(colors) - 1, _GRADIENT_STEPS).astype(int)]
+    steps = ", ".join(map(to_hex, chosen))
+    values = (f"<span>{format_rounded(float(norm.inverse(f)))}</span>" for f in (0, 0.5, 1))
+    words = escape(title.replace("\n", ": ", 1).replace("\n", " "))
+    return (
+        f'<div class="picture-scale"><p>{words}</p>'
+        f'<i style="background: linear-gradient(to right, {steps})"></i>{"".join(values)}</div>'
+    )
 
 
 def label_logarithms(axis: Axis, is_narrow: bool) -> None:

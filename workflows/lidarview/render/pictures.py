@@ -26,13 +26,13 @@ MAX_POINTS = 1_000_000  # maximum number of drawn points; a picture has only a f
 MAX_HITS = 200_000  # number of hit points for estimating the density
 MAX_PIECES = 100_000  # maximum number of additional triangles from dividing large triangles
 SOLID_RADIUS = 5.0  # minimum radius in half pixels where gaps are closed
-# More rays from a trajectory would hide the surfaces.
 MAX_RAYS = 600
-MAX_RAYS_OF_PATHS = 150
 # An object that covers this fraction of the ground is a floor or a hall.
 MIN_FLOOR_SHARE = 0.6
 MAX_COLORED = 12  # groups of objects with colors of their own; more could not be told apart
-_OTHERS = "#9fb0bf"
+# Floors and halls have colors between these two, and objects without a color of their own are dark.
+_FLOORS = (theme.CLAY, "#c9b68f")
+_OTHERS = "#62707f"
 
 
 def draw_scene(shot: SurfaceView, triangles: int) -> Page:
@@ -43,11 +43,14 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     the number of triangles in the caption.
     """
     scene = shot.scene
-    words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
+    objects = plural(len(scene.names), "object")
+    if shot.shown_box is not None:
+        objects += f", {len(np.unique(scene.face_object)):,} of them in the part shown"
+    words = f"{objects} · {plural(triangles, 'triangle')}"
     if scene.colors is not None:
         page = Page(shot.camera.size)
         page.draw_view(shot, shot.paint(scene.colors.mean_colors() / 255))
-        page.title("Scene", f"{words} · {shot.caption}", shot.models)
+        page.title("Scene", f"{words} · {shot.caption}", shot.details)
         return page
     kinds, names = _group_objects(scene.names, shot.actors)
     largest = _largest_groups(scene, kinds, shot.actors)
@@ -66,15 +69,22 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     legend = [entries[k] for k in shown]
     if others.any():
         legend.append((plural(int(others.sum()), "other object"), theme.rgb(_OTHERS)))
-    page.legend(legend, _sensor_label(shot))
-    page.title("Scene", f"{words} · {shot.caption}", shot.models)
+    page.legend(legend, _sensor_label(shot), _path_labels(shot))
+    page.title("Scene", f"{words} · {shot.caption}", shot.details)
     return page
 
 
 def draw_hits(
-    shot: SurfaceView, hit_counts: AnyArray, points: Floats, sample_rays: AnyFloats
+    shot: SurfaceView,
+    hit_counts: AnyArray,
+    points: Floats,
+    sample_rays: AnyFloats,
+    keep_every: int = 1,
 ) -> Page:
     """Draw a scene colored by hits per square meter, with the sensors and sample rays.
+
+    Rays of moving sensors are not drawn, because they start everywhere along a trajectory and would
+    hide the surfaces with the most hits.
 
     Parameters
     ----------
@@ -87,6 +97,8 @@ def draw_hits(
     sample_rays
         (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end inside
         the plot are drawn.
+    keep_every
+        The cloud contains one of this many hits of a scan.
     """
     hits = hit_counts[shot.part.parents] * shot.part.shares
     corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)
@@ -97,19 +109,34 @@ def draw_hits(
     )
     page = Page(shot.camera.size)
     axes = page.draw_view(shot, shot.subdivide(pieces, owner).paint(colors, 0.5))
-    page.draw_lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
+    lines = _path_labels(shot)
+    if not shot.paths:
+        page.draw_lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
+        lines = ["Some of the rays"]
     page.color_bar(TURBO, LogNorm(*limits), hits_title(limits))
     if label := _sensor_label(shot):  # below the color bar
-        page.legend([], label, rays="Some of the rays", bbox_to_anchor=(0.842, 0.17))
-    page.title("Hits", f"{plural(round(hit_counts.sum()), 'hit')} · {shot.caption}", shot.models)
+        page.legend([], label, lines, bbox_to_anchor=(0.842, 0.17))
+    words = plural(round(hit_counts.sum()), "hit") + _share_text(shot, points)
+    if keep_every > 1:
+        words += f" · one in {keep_every:,} hits of each scan is in the cloud"
+    page.title("Hits", f"{words} · {shot.caption}", shot.details)
     return page
 
 
 def _sensor_label(shot: SurfaceView) -> str:
     """Return the legend entry for the sensors, or an empty string without sensors."""
-    if shot.paths:
-        return "Sensor path"
     return "Sensor position" + "s" * (len(shot.sensors) > 1) if len(shot.sensors) else ""
+
+
+def _path_labels(shot: SurfaceView) -> list[str]:
+    """Return the legend entries for lines, which are the paths of moving sensors."""
+    return ["Sensor path" + "s" * (len(shot.paths) > 1)] if shot.paths else []
+
+
+def _share_text(shot: SurfaceView, points: Floats) -> str:
+    """Return a remark about the fraction of points in the shown part, if it is not all of them."""
+    share = shot.share_shown(points)
+    return f", {share:.0%} of them in the part shown" if share < 1 else ""
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
@@ -119,7 +146,7 @@ def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
     ray_ends = sample_rays[:, 1]
     inside = (ray_ends >= lowest - slack) & (ray_ends <= highest + slack)
     visible = sample_rays[inside.all(axis=1)]
-    count = min(len(visible), MAX_RAYS_OF_PATHS if shot.paths else MAX_RAYS)
+    count = min(len(visible), MAX_RAYS)
     return visible[np.linspace(0, len(visible) - 1, count).astype(int)]
 
 
@@ -130,6 +157,7 @@ def draw_cloud(
     column: Column = Z,
     names: Sequence[str] = (),
     solid: bool = False,
+    keep_every: int = 1,
 ) -> Page:
     """Draw a cloud, colored by a column, over the scene in pale colors.
 
@@ -147,6 +175,8 @@ def draw_cloud(
         Names of the values 0, 1, 2, … of a label column.
     solid
         Whether to close the gaps between points.
+    keep_every
+        The cloud contains one of this many hits of a scan.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
@@ -159,7 +189,7 @@ def draw_cloud(
         positions = cloud.positions - shot.scene.origin
         image = draw_points(image, shot, positions, colored.paint(values), solid)
         if colored.limits is None:
-            page.legend(colored.labels, _sensor_label(shot))
+            page.legend(colored.labels, _sensor_label(shot), _path_labels(shot))
         else:
             unit = f" ({colored.unit})"
             if not colored.unit:
@@ -170,7 +200,10 @@ def draw_cloud(
             page.color_bar(colored.scale, norm, (colored.name + unit).rstrip())
     page.draw_view(shot, image)
     by = "height" if column is Z else column.name.removesuffix("_deg").replace("_", " ")
-    page.title(f"Point cloud by {by}", f"{plural(count, 'point')} · {shot.caption}", shot.models)
+    words = plural(count, "point") + _share_text(shot, cloud.positions - shot.scene.origin)
+    if keep_every > 1:
+        words += f" · one in {keep_every:,} hits of each scan"
+    page.title(f"Point cloud by {by}", f"{words} · {shot.caption}", shot.details)
     return page
 
 
@@ -216,19 +249,20 @@ def _object_colors(scene: Scene, kinds: Ints, colored: Set[int]) -> Floats:
     """Return the colors of a scene's objects.
 
     All objects in a group have the same color, and so do all objects whose group is not `colored`.
-    Floors and halls are gray, so that the objects inside stand out.
+    Floors and halls are pale, so that the objects inside stand out.
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     scene_size = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
     fraction = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
-    gray = (fraction >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
+    pale = (fraction >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
     colors = np.empty((len(scene.names), 3))
     colors[:] = theme.rgb(_OTHERS)
-    distinct = ~gray & np.isin(kinds, list(colored))
+    distinct = ~pale & np.isin(kinds, list(colored))
     kind_numbers, kind = np.unique(kinds[distinct], return_inverse=True)
     colors[distinct] = theme.object_colors(len(kind_numbers))[kind]
-    steps = np.linspace(0, 0.22, max(int(gray.sum()), 1))[: int(gray.sum()), None]
-    colors[gray] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
+    steps = np.linspace(0, 1, max(int(pale.sum()), 1))[: int(pale.sum()), None]
+    first, last = map(theme.rgb, _FLOORS)
+    colors[pale] = first * (1 - steps) + last * steps
     return colors
 
 

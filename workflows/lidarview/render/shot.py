@@ -99,8 +99,9 @@ class SurfaceView:
     sensors: Floats  # (p, 3) local, in meters
     paths: tuple[Floats, ...]  # paths of moving sensors, (k, 3) each
     actors: int  # number of actors, which are the last objects of the scene
+    shown_box: Floats | None  # (2, 3) local bounds of the shown part; None if it is the whole scene
     caption: str  # number of sensors, and the time
-    models: str  # sensor models, for a second caption
+    details: str  # shown part and sensor models, for a second caption
     stage: PlotBox
     camera: Camera
     pixel_samples: RaySamples  # one sample through each pixel center
@@ -111,6 +112,18 @@ class SurfaceView:
     def scene(self) -> Scene:
         """Scene with the triangles to draw."""
         return self.part.scene
+
+    def share_shown(self, points: Floats) -> float:
+        """Return the fraction of local points (n, 3) that are in the shown part.
+
+        If the whole scene is shown, or if there are no points, the fraction is 1.
+        """
+        if self.shown_box is None or not len(points):
+            return 1.0
+        lower, upper = self.shown_box
+        # Ranges have noise, so points may lie slightly below the ground.
+        is_shown = (points <= upper).all(axis=1) & (points[:, :2] >= lower[:2]).all(axis=1)
+        return float(is_shown.mean())
 
     @property
     def depth(self) -> Floats32:
@@ -258,9 +271,7 @@ def take_shot(
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
     positions = np.concatenate([sensors, *paths])
-    caption = caption or plural(len(sensors), "sensor position")
     opened = _open_scene(scene, positions, trajectories, backend)
-    caption += opened.part_caption
     stage = _stage(opened.bounds, positions, scene.origin)
     viewpoint = _choose_viewpoint(opened.surface, stage, positions, size, bool(paths or actors))
     camera = viewpoint.camera
@@ -279,8 +290,9 @@ def take_shot(
         sensors=sensors,
         paths=tuple(paths),
         actors=actors,
-        caption=caption,
-        models=models,
+        shown_box=opened.shown_box,
+        caption=caption or plural(len(sensors), "sensor position"),
+        details=" · ".join(filter(None, (opened.caption, models))),
         stage=stage,
         camera=camera,
         pixel_samples=pixel_samples,
@@ -300,18 +312,24 @@ class _OpenScene(NamedTuple):
     cut_height: float | None  # None if the part is not cut open
 
     @property
-    def part_caption(self) -> str:
-        """Caption remark about the displayed part.
+    def shown_box(self) -> Floats | None:
+        """Local bounds of the displayed part. None if the entire scene is displayed."""
+        if self.box is None or self.cut_height is None:
+            return self.box
+        return self.box.clip(max=[np.inf, np.inf, self.cut_height])
+
+    @property
+    def caption(self) -> str:
+        """Caption with the bounds of the displayed part.
 
         It is an empty string if the entire scene is displayed.
         """
-        if self.box is None:
+        if (box := self.shown_box) is None:
             return ""
-        width, depth, _ = np.ptp(self.box, axis=0)
-        cut = self.cut_height
-        top = self.uncut.origin[2] + (self.box[1, 2] if cut is None else cut)
+        width, depth, _ = np.ptp(box, axis=0)
+        top = self.uncut.origin[2] + box[1, 2]
         area = f"{width:,.0f} × {depth:,.0f} m around the trajectories"
-        return f" · shown: {area}, below z = {top:,.0f} m"
+        return f"part shown: {area}, below z = {top:,.0f} m"
 
 
 def _open_scene(

@@ -89,7 +89,7 @@ def write_page(
         report=report,
         cloud=cloud,
         name="" if scenario is None or has_model else scenario.title,
-        pictures={"above": draw_top_view(top_view.counts, top_view.side_m, marks)},
+        pictures={"above": draw_top_view(top_view.counts, top_view.side_m, marks, _north(result))},
         marks=len(marks),
         densities=_density_range(top_view),
         changed=_changed_fields,
@@ -100,8 +100,8 @@ def write_page(
     path.write_text(text, encoding="utf-8")
 
 
-def insert_picture(page: Path, name: str, svg: str) -> None:
-    """Insert an image into a page that `write_page` has written.
+def insert_picture(page: Path, name: str, picture: str) -> None:
+    """Insert a picture, as HTML elements, into a page that `write_page` has written.
 
     The page does not change if it has no placeholder for the picture.
 
@@ -112,7 +112,7 @@ def insert_picture(page: Path, name: str, svg: str) -> None:
     """
     pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explain_os_errors(f"{page} cannot be written"):
-        text = pattern.sub(lambda match: f"{match[1]}>{svg}", page.read_text(encoding="utf-8"))
+        text = pattern.sub(lambda match: f"{match[1]}>{picture}", page.read_text(encoding="utf-8"))
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
@@ -138,8 +138,18 @@ def _station_marks(result: RunResult, top_view: Squares) -> list[_Mark]:
     ]
 
 
-def draw_top_view(counts: Floats | Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
-    """Draw point counts as a top view in SVG, with a scale bar.
+def _north(result: RunResult) -> str:
+    """Return the label of the direction up in the top view.
+
+    It is north only in a coordinate system of the Earth, and y in any other.
+    """
+    return "N" if result.survey.epsg and result.survey.coordinates == "world" else "y"
+
+
+def draw_top_view(
+    counts: Floats | Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = (), up: str = "N"
+) -> str:
+    """Draw point counts as a top view in SVG, with a scale bar and an arrow that points up.
 
     In dark mode, the page inverts the lightness of the points.
 
@@ -151,6 +161,8 @@ def draw_top_view(counts: Floats | Ints, pixel_m: float = 1.0, marks: Sequence[_
         Side length of a pixel in meters.
     marks
         Stations to mark. They are numbered unless there are too many.
+    up
+        Label of the arrow.
     """
     rows, columns = counts.shape
     letter = max(rows / 30, columns / 55)  # font size in pixels of the image
@@ -159,7 +171,8 @@ def draw_top_view(counts: Floats | Ints, pixel_m: float = 1.0, marks: Sequence[_
         f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
         f'<image {size} href="{_shade_counts(counts[::-1])}"/>'
         f'<g class="stations">{_draw_marks(marks, letter)}</g>'
-        f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}</svg>"
+        f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}"
+        f"{_arrow(columns, rows + 1.9 * letter, letter, up)}</svg>"
     )
 
 
@@ -213,6 +226,19 @@ def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> 
     return (
         f'<path class="scale" d="M0 {bottom - end:.1f}V{bottom:.1f}H{length:.1f}v{-end:.1f}"/>'
         f'<text class="scale" x="{length + 0.5 * letter:.1f}" y="{bottom:.1f}">{words}</text>'
+    )
+
+
+def _arrow(right: float, bottom: float, letter: float, up: str) -> str:
+    """Draw an arrow that points up, with its label on the left, at the right end of the view."""
+    x = right - 0.5 * letter
+    tip = bottom - 1.5 * letter
+    head = f"M{x - 0.35 * letter:.1f} {tip + 0.5 * letter:.1f}L{x:.1f} {tip:.1f}"
+    return (
+        f'<path class="up" d="M{x:.1f} {bottom:.1f}V{tip:.1f}{head}l{0.35 * letter:.1f} '
+        f'{0.5 * letter:.1f}"/>'
+        f'<text class="up" text-anchor="end" x="{x - 0.6 * letter:.1f}" y="{bottom:.1f}">'
+        f"{up}</text>"
     )
 
 
