@@ -18,7 +18,8 @@ NEW = sorted({*FILES} - {"path.png"})  # the earlier run planned a path, this on
 SCRIPT = """
 import json, os, signal, sys
 from pathlib import Path
-from lidarpool.report.output import _move_into_place
+from lidarpool.report.result_files import REPORT, obsolete_files
+from lidarpool.work.publishing import move_into_place
 
 root, files, earlier = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 
@@ -35,7 +36,7 @@ def publish(out, k):
             if not left[0]:
                 os.kill(os.getpid(), signal.SIGKILL)
     sys.addaudithook(count)
-    _move_into_place(whole, out, files, [], lambda: None)
+    move_into_place(whole, out, last=REPORT, remove=obsolete_files(files, []))
 
 killed = k = 1
 while killed:

@@ -115,12 +115,21 @@ class Result(RunResult):
         LidarError
             If a picture, size or column is unknown, or a file cannot be written.
         """
-        from ..report.result_pictures import draw_pictures
+        from ..report.result_pictures import publish_pictures
 
         check_list("only", only)
         check_fits("size", size, tuple[int, int])
-        cloud_folder = self._cloud_file.parent
-        return list(draw_pictures(self._pictured, cloud_folder, folder, only, size, color))
+        target = Path(folder)
+        names = publish_pictures(
+            self._pictured,
+            self._cloud_file.parent,
+            target,
+            target / "report.html",
+            only=only,
+            size=size,
+            color=color,
+        )
+        return [target / name for name in names]
 
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
         """Show the result in the browser until Ctrl-C, as `lidarpool view` does.

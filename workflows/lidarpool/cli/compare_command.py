@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
+from lidarsim.errors import explain_os_errors
 from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import join_alternatives, join_names
 
@@ -185,6 +187,7 @@ def compare(
       lidarpool compare flight.laz --survey strips --cell 2
     """  # noqa: D301 - Click requires the character \b
     from ..processes.freed_memory import keep_freed_memory
+    from ..work.publishing import publishing
 
     if survey != STRIPS and len(others) != 1:
         if not others:
@@ -208,11 +211,18 @@ def compare(
 
     with Terminal(as_json=as_json).writing("comparing the clouds", logged=False) as show:
         comparison = _compared(survey, a, others, settings | {"on_progress": show})
-    page = next(path for path in comparison.save(out) if path.suffix == ".html")
+    with ExitStack() as stack:
+        if points is not None:
+            stack.enter_context(explain_os_errors(f"{points} cannot be written"))
+            staged = stack.enter_context(publishing(points)) / points.name
+            comparison.save_points(staged)  # type: ignore[union-attr]  # it is one of surveys
+            # Earlier points must not be taken for those of the new comparison.
+            points.unlink(missing_ok=True)
+        saved = comparison.save(out)
+    page = next(path for path in saved if path.suffix == ".html")
     label = f"{'page':<{9 if survey is None else 10}}"
     lines = [repr(comparison), f"{label}{click.format_filename(page)}"]
     if points is not None:
-        comparison.save_points(points)  # type: ignore[union-attr]  # it is one of surveys
         lines.append(f"points    {click.format_filename(points)}")
     options.print_results(comparison.figures, lines, as_json)
 

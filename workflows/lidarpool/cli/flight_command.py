@@ -362,7 +362,8 @@ def _write_plan(
 
     `data` is the content of the scenario, and `notes` are written to its head.
     """
-    from ..clouds.folder import staging
+    from lidarsim.io.storage import staging
+
     from ..plan.flight_density import expected_density, summarize_density
     from ..plan.flight_files import to_geojson, to_kml
     from ..report.flight_map import draw_flight

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -12,6 +10,7 @@ from lidarscenes.files.lenient_xml import parse_lenient_xml
 from lidarsim.environment.plugins import Plugin, find_plugin
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
+from lidarsim.io.storage import staging
 from lidarsim.words import printable
 
 # Entry point group of importers. The name of an entry point is the root tag of an XML file, without
@@ -119,15 +118,11 @@ def import_atomically(
         If the survey cannot be converted, or the scenario is invalid.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        unsupported = [*write(survey, partial, assets)]
-        check(partial / SCENARIO_FILE)
-        partial.chmod(0o755)  # temporary folders are only accessible to their owner
-        partial.rename(folder)
+        with staging(folder.parent, folder, folder.name) as partial:
+            unsupported = [*write(survey, partial, assets)]
+            check(partial / SCENARIO_FILE)
+            partial.rename(folder)
     except LidarError as error:
-        message = str(error).replace(str(partial), str(folder))
-        raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        raise LidarError(f"{survey} cannot be converted to a scenario: {error}") from error
     return unsupported

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.errors import LidarError
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.schema.vocabulary import PICTURES
 
 from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
@@ -81,25 +81,24 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     """  # noqa: D301 - Click requires the character \b
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-    from ..clouds.folder import local_folder, local_result, upload
+    from ..clouds.folder import local_result, path_in
     from ..processes.freed_memory import keep_freed_memory
     from ..report.result_files import CLOUD, PAGE
-    from ..report.result_pictures import draw_pictures
+    from ..report.result_pictures import publish_pictures
 
     target = result if out is None else out
-    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as folder_of_result:
-        if not (folder_of_result / PICTURE_FILE).exists():
+    with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as folder:
+        if not (folder / PICTURE_FILE).exists():
             raise LidarError(
                 f"{result} does not contain {PICTURE_FILE}, from which the pictures are drawn. "
                 "Pass the output folder of a finished run."
             )
         keep_freed_memory()
-        content = PictureContent.load(folder_of_result / PICTURE_FILE)
-        with nullcontext(folder_of_result) if out is None else local_folder(out) as folder:
-            for path in draw_pictures(content, folder_of_result, folder, **settings):
-                click.echo(click.format_filename(upload(path, target)))
-            if out is None and (folder_of_result / PAGE).exists():
-                upload(folder_of_result / PAGE, target)
+        content = PictureContent.load(folder / PICTURE_FILE)
+        page_folder = folder if out is None else out
+        page = page_folder / PAGE if isinstance(page_folder, Path) else None
+        for name in publish_pictures(content, folder, target, page, **settings):
+            click.echo(click.format_filename(path_in(target, name)))
 
 
 @click.command()
@@ -170,11 +169,13 @@ def export(
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - Click requires the character \b
     from lidarsim.columns.cloud_file import CloudFile
+    from lidarsim.io.storage import staging
     from lidarsim.sweeps.instruments import INSTRUMENT_FILES
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-    from ..clouds.folder import local_result, result_folder, upload
+    from ..clouds.folder import local_result, path_in, result_folder
+    from ..work.publishing import move_into_place
 
     # report.json is written last, so it marks a complete result.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -199,11 +200,15 @@ def export(
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
             try:
                 for chosen in specs:
-                    file = folder / chosen.row.file
-                    full_scale = chosen.write(
-                        file, cloud, sweeps, overwrite=overwrite, content=pictures
-                    )
-                    written.append(click.format_filename(upload(folder / chosen.row.file, target)))
+                    name = chosen.row.file
+                    path = path_in(target, name)
+                    with (
+                        explain_os_errors(f"{path} cannot be written"),
+                        staging(folder, target) as staged,
+                    ):
+                        full_scale = chosen.write(staged / name, cloud, sweeps, content=pictures)
+                        move_into_place(staged, target, last=name)
+                    written.append(click.format_filename(path))
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
                     if full_scale is not None:

@@ -199,7 +199,8 @@ def _plan(
     scenario: Scenario, model: str | None, folder: Path, as_json: bool, **settings: Any
 ) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
-    from ..clouds.folder import staging
+    from lidarsim.io.storage import staging
+
     from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
     from .terminal import Terminal

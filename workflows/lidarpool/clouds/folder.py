@@ -8,15 +8,13 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import secrets
-import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from lidarsim.errors import LidarError, MissingFileError, as_sentence, explain_os_errors
-from lidarsim.io.storage import WRITING, Storage, is_url
+from lidarsim.io.storage import Storage, is_url
 
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 
@@ -27,6 +25,11 @@ def output_destination(text: str | Path) -> Path | Storage:
     It is remote storage if the text is a URL.
     """
     return Storage.at(text) if is_url(text) else Path(text)
+
+
+def path_in(output: Path | Storage, name: str) -> str:
+    """Return the path or URL of a file in an output, for messages."""
+    return output.path(name) if isinstance(output, Storage) else str(output / name)
 
 
 def check_not_existing(files: Iterable[Path], *, overwrite: bool) -> None:
@@ -137,29 +140,6 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
         yield folder
 
 
-def upload(path: Path, output: Path | Storage) -> str:
-    """Copy a file or folder from `result_folder` to storage, unless the output is local.
-
-    An existing file or folder with the same name is replaced.
-
-    Returns
-    -------
-    The path or URL of the file or folder, for messages.
-
-    Raises
-    ------
-    LidarError
-        If the storage cannot be written to.
-    """
-    if not isinstance(output, Storage):
-        return str(path)
-    url = output.path(path.name)
-    with explain_os_errors(f"{url} cannot be written"):
-        output.discard(path.name)
-        output.put(path, path.name)
-    return url
-
-
 @contextmanager
 def local_folder(output: Path | Storage) -> Iterator[Path]:
     """Yield a local folder for the output.
@@ -173,22 +153,6 @@ def local_folder(output: Path | Storage) -> Iterator[Path]:
         folder = Path(temporary, output.url.rpartition("/")[2])
         folder.mkdir()
         yield folder
-
-
-@contextmanager
-def staging(folder: Path, shown: object = None) -> Iterator[Path]:
-    """Create a temporary subfolder for files that are moved into place once they are complete.
-
-    Error messages mention `shown` instead of the temporary folder (default: `folder`).
-    """
-    staged = folder / f"{WRITING}{secrets.token_hex(4)}"
-    try:
-        staged.mkdir()
-        yield staged
-    except LidarError as error:
-        raise LidarError(str(error).replace(str(staged), str(shown or folder))) from error
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
 
 
 def _lock(folder: Path) -> int:

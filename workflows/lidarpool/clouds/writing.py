@@ -18,7 +18,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import SCAN
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
-from lidarsim.io.storage import Storage, flush
+from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_fields
 from lidarsim.schema.declared import FileSection, about
 from lidarsim.schema.value_texts import one_line
@@ -28,8 +28,8 @@ from lidarsim.words import join_alternatives, join_names
 from lidarview.picture_file import PictureContent
 
 from ..columns.parts import StoredCloud
+from ..work.publishing import publishing
 from .cloud_format import CloudFormat
-from .folder import staging
 from .format_row import FormatRow
 from .format_table import EXPORTS, FORMATS, LAYOUTS, format_row, load_format
 from .multi_file_format import MultiFileFormat, RangeWorkers
@@ -415,20 +415,15 @@ class ExportSpec(FileSection):
         full_scale: float | None = None
         with explain_os_errors(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
-            with staging(path.parent) as staging_folder:
+            with publishing(path) as folder:
                 # The file has its final name, because bags contain the name of their file.
-                staged = staging_folder / path.name
+                staged = folder / path.name
                 output = self.cloud_format(cloud, self.configure_sweeps(sweeps))
                 if isinstance(output, MultiFileFormat):
                     output.write(staged, self, workers)
                 else:
                     output.content = content
                     full_scale = output.write(staged, self)
-                flush(staged)
-                if path.is_dir() or staged.is_dir():  # only files are replaced atomically
-                    Storage.at(path.parent).discard(path.name)
-                staged.replace(path)
-                flush(path.parent)
         return full_scale
 
     def write_to_storage(

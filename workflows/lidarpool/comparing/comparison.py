@@ -20,7 +20,7 @@ class Comparison(ComparisonData):
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and the charts, and return their paths.
 
-        The folder is created if it does not exist. Pictures of an earlier comparison are removed.
+        The folder is created if it does not exist. An earlier comparison is replaced.
 
         Raises
         ------

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from lidarsim.errors import explain_os_errors
 
-from ..clouds.folder import result_folder, staging
+from ..clouds.folder import result_folder
+from ..work.publishing import publishing
 
 if TYPE_CHECKING:
     from lidarview.render.picture_page import Page
 
+FIGURES = "compare.json"
+PAGE = "compare.html"
+TABLE = "compare.csv"
 # Pictures of all kinds of comparisons.
 _PICTURES = ("ranges", "rings", "distances", "above", "map", "facades", "histogram")
 
@@ -23,11 +27,11 @@ def write_comparison(
     figures: Mapping[str, Any],
     report: str,
     pages: Mapping[str, Page],
-    texts: Mapping[str, str] | None = None,
+    table: str | None = None,
 ) -> list[Path]:
     """Write the files of a comparison, and return their paths.
 
-    The folder is created if it does not exist. Pictures of an earlier comparison are removed.
+    The folder is created if it does not exist. An earlier comparison is replaced.
 
     Parameters
     ----------
@@ -39,8 +43,8 @@ def write_comparison(
         Content of compare.html.
     pages
         Pictures by name, such as "map" for compare-map.png.
-    texts
-        Content of further files by file name.
+    table
+        Content of compare.csv, if there is one.
 
     Raises
     ------
@@ -48,21 +52,18 @@ def write_comparison(
         If the folder cannot be written to.
     """
     path = Path(folder)
+    texts = {FIGURES: json.dumps(figures, indent=1, allow_nan=False) + "\n", PAGE: report}
+    if table is not None:
+        texts[TABLE] = table
+    files = {name: text.encode() for name, text in texts.items()}
+    files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
+    known = [TABLE, *(f"compare-{name}.png" for name in _PICTURES)]
+    obsolete = [name for name in known if name not in files]
     with (
         result_folder(path),
         explain_os_errors(f"The comparison cannot be written to {path}", "free some disk space"),
-        staging(path) as staged,
+        publishing(path / FIGURES, remove=obsolete) as staged,
     ):
-        content = {
-            "compare.json": json.dumps(figures, indent=1, allow_nan=False) + "\n",
-            "compare.html": report,
-            **(texts or {}),
-        }
-        files = {name: text.encode() for name, text in content.items()}
-        files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
         for name, data in files.items():
             (staged / name).write_bytes(data)
-        for name in _PICTURES:
-            if name not in pages:
-                (path / f"compare-{name}.png").unlink(missing_ok=True)
-        return [(staged / name).replace(path / name) for name in files]
+    return [path / name for name in files]

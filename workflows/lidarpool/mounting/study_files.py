@@ -15,6 +15,7 @@ import yaml
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.errors import explain_os_errors
+from lidarsim.io.storage import staging
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
@@ -22,7 +23,6 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.words import printable
 from lidarview.page_templates import render_template
 
-from ..clouds.folder import staging
 from ..scenario.mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .pictures import draw_all

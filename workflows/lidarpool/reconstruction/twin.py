@@ -21,10 +21,10 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.models import SensorModel
 from lidarview.page_templates import render_template
 
-from ..clouds.folder import result_folder, staging
+from ..clouds.folder import result_folder
 from ..comparing import lidar4d
 from ..scenario.point_scene import CLASS_MATERIAL
-from ..work.publishing import move_into_place
+from ..work.publishing import publishing
 from .labels import SurfelMaterial
 from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, class_names
@@ -119,10 +119,9 @@ class Twin:
             explain_os_errors(
                 f"The reconstruction cannot be written to {path}", "free some disk space"
             ),
-            staging(path) as staged,
+            publishing(path / SCENARIO_FILE, remove=[ACTORS_FOLDER]) as staged,
         ):
             self.write(staged)
-            move_into_place(staged, path, last=SCENARIO_FILE, remove=[ACTORS_FOLDER])
         return [path / name for name in self.file_names]
 
     @property

@@ -7,7 +7,7 @@ complete result or none.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from lidarsim.columns.table import optional_columns
-from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import explain_os_errors
-from lidarsim.io.storage import Storage, flush
+from lidarsim.io.storage import Storage, staging
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
-from ..clouds.folder import result_folder, staging
+from ..clouds.folder import result_folder
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
@@ -40,6 +39,7 @@ from ..run.runner import cast, open_store
 from ..run.store.run_store import RunStore
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
+from ..work.publishing import move_into_place
 from .cloud_counts import CloudCounts
 from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content
@@ -51,7 +51,7 @@ from .result_files import (
     REPORT,
     check_existing,
     formats_of_files,
-    known_optional_files,
+    obsolete_files,
     optional_files,
     read_earlier,
 )
@@ -226,13 +226,12 @@ class SurveyOutput:
     ) -> dict[str, Any]:
         """Write the cloud, the images and the report to the target.
 
-        In a local folder, files are first written to a temporary folder within `folder`. They are
-        moved into place after all of them have been flushed to the disk, so an earlier result stays
-        intact if a file cannot be written. Pictures of an earlier result are removed if the new
-        result does not have them.
+        All files are first written to a temporary folder within `folder`, and then moved into
+        place, with report.json last, so an earlier result stays intact if a file cannot be written.
+        Files of the earlier result that the new one does not have are removed.
 
-        In a remote storage, all files are uploaded, with report.json last. Files that workers write
-        are written to the storage directly, after an earlier result has been removed.
+        In a remote storage, files that workers write are written directly, after report.json and
+        the page of an earlier result have been removed.
 
         Parameters
         ----------
@@ -281,7 +280,8 @@ class SurveyOutput:
             others = [entry for entry in self.formats if entry not in sent]
             full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
-                _remove_earlier(target, further, earlier)
+                for name in (REPORT, PAGE, *(entry.row.file for entry in sent)):
+                    target.discard(name)
                 for output_format in sent:
                     points = _points_with_progress(result, output_format.row.file, show)
                     output_format.write_to_storage(target, points, sweeps, workers)
@@ -299,14 +299,13 @@ class SurveyOutput:
                 self._write_page(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.record_step(timeline.REPORT_WRITTEN)
-            if isinstance(self.target, Storage):
-                if not sent:
-                    _remove_earlier(target, further, earlier)
-                _upload(staged, target, further)
-                with defer_interrupts():
-                    on_written()
-            else:
-                _move_into_place(staged, folder, report["files"], earlier, on_written)
+            move_into_place(
+                staged,
+                target,
+                last=REPORT,
+                remove=obsolete_files(report["files"], earlier),
+                on_written=on_written,
+            )
         timeline.record_step(timeline.IN_PLACE)
         return report
 
@@ -410,50 +409,3 @@ def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) 
     report["files"] = [CLOUD, *further, *present]
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
     (staged / REPORT).write_text(text, encoding="utf-8")
-
-
-def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
-    """Upload the files of a result to a storage, ending with report.json."""
-    for name in (*known_optional_files(further), *FILES):
-        if (staged / name).exists():
-            storage.put(staged / name, name)
-
-
-def _move_into_place(
-    staged: Path,
-    folder: Path,
-    files: Collection[str],
-    earlier: Collection[str],
-    on_written: Callable[[], object],
-) -> None:
-    """Move all files of a result into place, ending with report.json.
-
-    If the process is killed, the run can be resumed, because its parts are only removed afterward.
-    """
-    for name in files:  # `on_written` removes the parts, the only other copy of the points
-        flush(staged / name)
-    with defer_interrupts():
-        _remove_earlier(Storage.at(folder), files, earlier)
-        for name in (*known_optional_files(files), *FILES):
-            if name in files:
-                (staged / name).replace(folder / name)
-        flush(folder)  # makes the renames durable before the parts are removed
-        on_written()
-
-
-def _remove_earlier(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
-    """Remove the files of an earlier result before the new `files` are moved into place.
-
-    report.json and the page are removed first, and a local folder is flushed afterward, because
-    report.json marks a complete result. Next, files and folders of formats are removed if `files`
-    replaces them or if the `earlier` result lists them. If a run was killed after the removal of
-    report.json, the list is lost, and the files of other formats remain. Finally, those of the
-    `FILES` that the new result does not have are removed.
-    """
-    further = known_optional_files({*files, *earlier})
-    # Remaining pictures of an earlier result would appear to belong to the new result.
-    missing = [name for name in FILES if name not in files]
-    for name in (REPORT, PAGE, *further, *missing):
-        target.discard(name)
-        if name == PAGE and target.is_local:  # a crash must not leave the old report behind
-            flush(target.local())

@@ -105,6 +105,17 @@ def known_optional_files(names: Collection[str]) -> list[str]:
     return [format_row(name).file for name in formats_of_files(names)] + measured
 
 
+def obsolete_files(files: Collection[str], earlier: Collection[str]) -> list[str]:
+    """Return the files of an `earlier` result to remove before the new `files` are published.
+
+    The page is always included, because it must not appear beside other files than its own. If a
+    run was killed after the removal of report.json, the list of earlier files is lost, and the
+    files of other formats remain. Remaining pictures would appear to belong to the new result.
+    """
+    known = (*known_optional_files(earlier), *FILES)
+    return [PAGE, *(name for name in known if name not in files and name != PAGE)]
+
+
 class EarlierResult(NamedTuple):
     """Properties of a result that exists before the run."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -20,6 +21,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
 from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.io.storage import Storage, staging
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
@@ -33,8 +35,11 @@ from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_sc
 from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
+from ..clouds.folder import result_folder
 from ..plan.stations import StationPlan, StationVisibility
+from ..work.publishing import move_into_place
 from .page.rendering import insert_picture
+from .result_files import PAGE
 
 MIN_SIDE = 480  # pixels; text would be illegible in smaller pictures
 MAX_SIDE = 4096  # pixels; drawing takes 0.4 kB of memory per pixel
@@ -51,10 +56,52 @@ COLORS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY, "#c8
 _BLOCK = 4  # side length of a block in pixels
 
 
+def publish_pictures(
+    shown: PictureContent,
+    result: Path,
+    target: Path | Storage,
+    page: Path | None,
+    *,
+    only: Sequence[str] = (),
+    size: tuple[int, int] = SIZE,
+    color: str = Z.name,
+) -> list[str]:
+    """Draw images of a result, and write them to a folder or storage when all are complete.
+
+    Parameters
+    ----------
+    target
+        Folder or storage for the pictures, created if necessary.
+    page
+        Existing report.html of the target, into which the pictures are inserted.
+
+    The other parameters are those of `draw_pictures`.
+
+    Returns
+    -------
+    The names of the pictures.
+
+    Raises
+    ------
+    LidarError
+        If raised by `draw_pictures`, or if the target cannot be written to.
+    """
+    with (
+        explain_os_errors(f"The pictures cannot be written to {target}", "free some disk space"),
+        result_folder(target) as folder,
+        staging(folder, target) as staged,
+    ):
+        if page is not None and page.exists():
+            shutil.copyfile(page, staged / PAGE)
+        names = [path.name for path in draw_pictures(shown, result, staged, only, size, color)]
+        move_into_place(staged, target, last=names[-1])
+    return names
+
+
 def draw_pictures(
     shown: PictureContent,
     result: Path,
-    folder: str | Path,
+    folder: Path,
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
     color: str = Z.name,
@@ -72,7 +119,7 @@ def draw_pictures(
     result
         Folder of the result, which contains the cloud.
     folder
-        Folder for the pictures, created if necessary.
+        Folder for the pictures.
     only
         Names of the pictures to draw. By default, all available pictures are drawn.
     size
@@ -89,11 +136,10 @@ def draw_pictures(
     Raises
     ------
     LidarError
-        If a picture is unknown or not available, if its size is not supported, or if the folder
-        cannot be created.
+        If a picture is unknown or not available, or if its size is not supported.
     """
     cloud = result / "cloud.ply"
-    page = Path(folder) / "report.html"
+    page = folder / PAGE
     shorter = min(size)
     longer = max(size)
     if shorter < MIN_SIDE or longer > MAX_SIDE or longer > MAX_RATIO * shorter:
@@ -114,12 +160,10 @@ def draw_pictures(
             elif shown.coordinates == "sensor":
                 why = "its points are in sensor coordinates"
             raise LidarError(f"The picture {name!r} cannot be drawn, because {why}.")
-    with explain_os_errors(f"The folder {folder} cannot be created", "specify another folder"):
-        Path(folder).mkdir(parents=True, exist_ok=True)
     names = only or [*makers]
     for number, name in enumerate(names):
         show("pictures", number, len(names), "pictures")
-        path = Path(folder) / f"{name}.png"
+        path = folder / f"{name}.png"
         picture = makers[name]()
         picture.save(path)
         if page.exists():

@@ -14,7 +14,7 @@ import yaml
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import Storage
+from lidarsim.io.storage import replace_file
 from lidarsim.numerics.arrays import Floats
 from lidarsim.sensor.models import MODEL_FILES, SensorModel
 from lidarsim.sensor_files.fired_rays import RayList
@@ -73,7 +73,7 @@ class PatternFit:
                 format_of(path, None).function("write")(path, self.rays, _NOT_RECORDED)
             else:
                 text = _model_text(self.model, repr(self))
-                Storage.at(path.parent, durable=False).write(path.name, text.encode())
+                replace_file(path, text.encode())
         return [path]
 
 

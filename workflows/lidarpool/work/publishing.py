@@ -1,60 +1,118 @@
-"""Move the files of a finished result into place."""
+"""Publish results: their files are staged, and moved into place when all of them are complete."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import secrets
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidarsim.environment.interrupts import defer_interrupts
-from lidarsim.io.storage import Storage, flush
+from lidarsim.io.storage import WRITING, Storage, flush, staging
+
+
+@contextmanager
+def publishing(target: Path, remove: Iterable[str] = ()) -> Iterator[Path]:
+    """Yield a folder for the files of a result, and then move them to the folder of `target`.
+
+    Parameters
+    ----------
+    target
+        File or folder that is moved last. See `move_into_place`.
+    remove
+        Further files and folders of an earlier result to remove.
+    """
+    folder = target.absolute().parent
+    with staging(folder, target.parent, target.name) as staged:
+        yield staged
+        move_into_place(staged, folder, last=target.name, remove=remove)
 
 
 def move_into_place(
     staged: Path,
-    folder: Path,
+    target: Path | Storage,
     *,
     last: str,
     remove: Iterable[str] = (),
     on_written: Callable[[], object] = lambda: None,
-) -> list[Path]:
-    """Move all files and folders in a staging folder to the folder of the result.
+) -> None:
+    """Move all files and folders in a staging folder to the folder or storage of the result.
 
-    All files are flushed to the disk first. If the process is then killed at any time, the folder
-    contains the earlier result, the new result, or a result whose file `last` is missing.
+    All files are flushed to the disk or uploaded first. If the process is then killed at any time,
+    the target contains the earlier result, the new result, or a result whose file `last` is
+    missing.
 
     Parameters
     ----------
     staged
-        Folder with the files, in the same file system.
-    folder
-        Folder of the result, which the caller has locked. Files and folders with the same names
-        are replaced.
+        Folder with the files. If the target is a folder, it is in the same file system.
+    target
+        Folder or storage of the result, which the caller has locked. Files and folders with the
+        same names are replaced.
     last
-        File that marks a complete result. It is removed before, and moved after, all others.
+        File or folder that marks a complete result. It is removed before, and moved after, all
+        others. Pages are moved shortly before.
     remove
         Further files and folders of an earlier result to remove.
     on_written
         Function that is called when all files are in place, before a pending interrupt is raised.
-
-    Returns
-    -------
-    The moved files and folders, which end with `last`.
     """
-    names = sorted(path.name for path in staged.iterdir() if path.name != last)
-    for path in staged.rglob("*"):
-        if path.is_file():
-            flush(path)
-    target = Storage.at(folder)
-    with defer_interrupts():
-        # A file is replaced in one operation, in contrast to a folder.
-        folders = [name for name in names if (folder / name).is_dir() or (staged / name).is_dir()]
-        for name in (last, *remove, *folders):
-            target.discard(name)
-        flush(folder)  # a crash must not leave an earlier `last` beside new files
+    storage = Storage.at(target)
+    names = sorted(
+        (path.name for path in staged.iterdir() if path.name != last),
+        key=lambda name: (name.endswith(".html"), name),
+    )
+    entries = storage.entries()
+    # A file is replaced in one operation, in contrast to a folder.
+    folders = [
+        name for name in (last, *names) if (staged / name).is_dir() or entries.get(name, 0) is None
+    ]
+    obsolete = [*remove, *folders]
+    with _prepared(staged, storage, last) as move, defer_interrupts():
+        if names or obsolete:
+            storage.discard(last)
+            _flush(storage)  # a crash must not leave an earlier `last` beside other changes
+        for name in obsolete:
+            storage.discard(name)
         for name in names:
-            (staged / name).replace(folder / name)
-        flush(folder)
-        (staged / last).replace(folder / last)
-        flush(folder)  # makes the moves durable before anything else is removed
+            move(name)
+        _flush(storage)
+        move(last)
+        _flush(storage)  # makes the moves durable before anything else is removed
         on_written()
-    return [folder / name for name in (*names, last)]
+
+
+@contextmanager
+def _prepared(staged: Path, storage: Storage, last: str) -> Iterator[Callable[[str], object]]:
+    """Flush or upload staged files, and yield a function that moves a file or folder into place.
+
+    Object stores cannot rename files, so uploaded files are copied within the storage. What killed
+    processes have uploaded for the same result is removed.
+    """
+    if storage.is_local:
+        for path in staged.rglob("*"):
+            flush(path)
+        folder = storage.local()
+        yield lambda name: (staged / name).replace(folder / name)
+        return
+    uploaded = f"{WRITING}{last}-{secrets.token_hex(4)}"
+
+    def copy(name: str) -> None:
+        files = [*(staged / name).rglob("*")] if (staged / name).is_dir() else [staged / name]
+        # A folder whose first file is missing is visibly incomplete.
+        for file in sorted(filter(Path.is_file, files), reverse=True):
+            place = file.relative_to(staged).as_posix()
+            storage.copy_from(storage, f"{uploaded}/{place}", place)
+
+    storage.remove_unfinished(last)
+    try:
+        storage.put(staged, uploaded)
+        yield copy
+    finally:
+        with suppress(OSError):
+            storage.discard(uploaded)
+
+
+def _flush(storage: Storage) -> None:
+    if storage.is_local:
+        flush(storage.local())

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy as np
 import yaml
 
 from lidarsim.errors import LidarError, prefix_errors
+from lidarsim.io.storage import staging
 from lidarsim.media.materials import MOR_SHARE
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
@@ -99,21 +98,17 @@ def import_survey(
             message = f"{survey}: {message}"
         raise LidarError(message) from error
     folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        for name, text in survey_import.files(folder).items():
-            (partial / name).write_text(text, encoding="utf-8", newline="\n")
-        for part in survey_import.scene.parts:
-            if part.surfels is not None:
-                write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
-        check(partial / SCENARIO_FILE)
-        partial.chmod(0o755)  # only its owner can read a folder from mkdtemp
-        partial.rename(folder)
+        with staging(folder.parent, folder, folder.name) as partial:
+            for name, text in survey_import.files(folder).items():
+                (partial / name).write_text(text, encoding="utf-8", newline="\n")
+            for part in survey_import.scene.parts:
+                if part.surfels is not None:
+                    write_scene(partial / part.file.name, Scene.from_meshes([part.surfels]))
+            check(partial / SCENARIO_FILE)
+            partial.rename(folder)
     except LidarError as error:
-        message = str(error).replace(str(partial), str(folder))
-        raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        raise LidarError(f"{survey} cannot be converted to a scenario: {error}") from error
     return ImportedSurvey(folder / SCENARIO_FILE, survey_import.unsupported)
 
 

@@ -12,7 +12,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
-from lidarsim.io.storage import Storage
+from lidarsim.io.storage import replace_file
 from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
@@ -46,7 +46,7 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     check_target(path)
     data = _encoded(path.suffix.lower(), scene)
     with explain_os_errors(f"{path} cannot be written"):
-        Storage.at(path.parent, durable=False).write(path.name, data)
+        replace_file(path, data)
     return path
 
 

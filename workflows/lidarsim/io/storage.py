@@ -12,11 +12,12 @@ import re
 import reprlib
 import secrets
 import shutil
+import sys
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,7 +30,9 @@ from .input_files import open_input
 _BLOCK_BYTES = 1 << 20  # bytes to read at a time when a file is copied or its checksum computed
 TEMPORARY = ".lidarpool-tmp-"  # name prefix of unfinished files
 WRITING = ".lidarpool-writing-"  # name prefix of folders that contain unfinished files
-_LEFTOVER = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
+_LEFTOVER = re.compile(
+    rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)}(?:(.+)-)?)[0-9a-f]{{8}}"
+)
 
 
 def final_name(name: str) -> str:
@@ -340,8 +343,9 @@ class Storage:
                 return
         with source._remote() as (source_system, folder), self._remote() as (system, target_folder):
             if source_system is system and not self.is_local:
-                system.cp_file(f"{folder}/{name}", f"{target_folder}/{new_name}")
-                return
+                with suppress(NotImplementedError):  # for example, SFTP
+                    system.cp_file(f"{folder}/{name}", f"{target_folder}/{new_name}")
+                    return
         with source._reading(name) as source_file, self.writing(new_name) as file:
             shutil.copyfileobj(source_file, file, _BLOCK_BYTES)
 
@@ -436,19 +440,117 @@ class Storage:
             with suppress(FileNotFoundError), self._remote() as (system, folder):
                 system.rm(f"{folder}/{name}", recursive=True)
 
-    def remove_unfinished(self, *, deep: bool = True) -> None:
-        """Remove unfinished files that killed processes left in a local folder.
+    def remove_unfinished(self, final: str | None = None, *, deep: bool = True) -> None:
+        """Remove unfinished files and folders that killed processes left in the folder.
 
-        If `deep` is true, subfolders are cleaned up as well.
+        Files that are locked by a living process (see `lock`) are kept. There are no locks in
+        remote storage, so nothing is removed there unless `final` is specified.
+
+        Parameters
+        ----------
+        final
+            Only remove what was written for the file or folder with this name.
+        deep
+            Whether the subfolders of a local folder are cleaned up as well.
         """
         if not self.is_local:
+            if final is not None:
+                for name in filter(partial(_is_leftover, final), self.entries()):
+                    self.discard(name)
             return
         for folder, folders, files in os.walk(self.local()):
             for path in (Path(folder, name) for name in (*folders, *files)):
-                if _LEFTOVER.fullmatch(path.name) and not path.is_symlink():
+                if _is_leftover(final, path.name) and not path.is_symlink() and not is_locked(path):
                     self.discard(path.relative_to(self.url).as_posix())
             if not deep:
                 break
+
+
+def _is_leftover(final: str | None, name: str) -> bool:
+    match = _LEFTOVER.fullmatch(name)
+    return match is not None and final in (None, *match.groups())
+
+
+@contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """Lock an unfinished file or folder, so that other processes do not remove it."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a network disk without locks
+            _flock(handle, wait=True)
+        yield
+    finally:
+        os.close(handle)
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether `lock` is in use for a file or folder in any process."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        _flock(handle, wait=False)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return False
+
+
+def _flock(handle: int, *, wait: bool) -> None:
+    if sys.platform != "win32":
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextmanager
+def replacing_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file that replaces an existing one when the context exits without an error.
+
+    What killed processes have left for the same file is removed.
+    """
+    path = path.absolute()
+    storage = Storage.at(path.parent)
+    storage.remove_unfinished(path.name, deep=False)
+    with storage._replacing(path) as file, lock(Path(file.name)):
+        yield file
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file atomically, and flush it to disk."""
+    with replacing_file(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def staging(folder: Path, shown: object = None, final: str = "") -> Iterator[Path]:
+    """Create a temporary subfolder for files that are moved into place once they are complete.
+
+    Parameters
+    ----------
+    folder
+        Folder of the result.
+    shown
+        What error messages mention instead of the temporary folder (default: `folder`).
+    final
+        Name of the file or folder of the result. What killed processes have staged for it is
+        removed. It is unnecessary if the caller has removed all unfinished files in the folder.
+    """
+    staged = folder / f"{WRITING}{f'{final}-' * bool(final)}{secrets.token_hex(4)}"
+    try:
+        if final:
+            Storage.at(folder).remove_unfinished(final, deep=False)
+        staged.mkdir()
+        with lock(staged):
+            yield staged
+    except LidarError as error:
+        raise LidarError(str(error).replace(str(staged), str(shown or folder))) from error
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
 
 
 def flush(path: Path) -> None:

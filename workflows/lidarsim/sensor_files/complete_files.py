@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import IO
 
 from ..errors import explain_os_errors
-from ..io.storage import Storage
+from ..io.storage import replacing_file
 
 
 @contextmanager
@@ -17,11 +17,10 @@ def open_complete(path: Path) -> Iterator[IO[bytes]]:
 
     Raises LidarError if the file cannot be written.
     """
-    with (
-        explain_os_errors(f"{path} cannot be written"),
-        Storage.at(path.parent, durable=False).writing(path.name) as file,
-    ):
-        yield file
+    with explain_os_errors(f"{path} cannot be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing_file(path) as file:
+            yield file
 
 
 def write_complete_text(path: Path, text: str) -> None:

@@ -26,7 +26,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from lidarsim.errors import explain_os_errors
-from lidarsim.io.storage import Storage
+from lidarsim.io.storage import replace_file
 from lidarsim.numerics.arrays import AnyFloats, Floats
 from lidarsim.words import format_rounded, shorten_name
 
@@ -487,7 +487,7 @@ class Page:
         """
         advice = "choose an existing, writable folder with enough free space"
         with explain_os_errors(f"The picture {path} could not be written", advice):
-            Storage.at(path.parent, durable=False).write(path.name, self.png())
+            replace_file(path, self.png())
 
     def png(self) -> bytes:
         """Return the page as PNG data in light colors."""

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import Storage
+from lidarsim.io.storage import replace_file
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.colors import as_bytes
@@ -110,7 +110,7 @@ def export_view(
                 render_page(view, show) if file == page else render_film(view, file.suffix, show)
             )
         with explain_os_errors(f"{file} cannot be written", "choose another path"):
-            Storage.at(file.parent, durable=False).write(file.name, content)
+            replace_file(file, content)
         click.echo(click.format_filename(file))
 
 

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
-from lidarsim.io.storage import Storage, flush
 from lidarsim.words import list_names, plural
 
-from ...clouds.folder import staging
+from ...work.publishing import publishing
 
 # A folder that contains this file was written by this program, which may therefore replace it.
 MARK_FILE = ".lidarpool-augmented"
@@ -166,14 +165,9 @@ def new_target(target: Path) -> Iterator[Path]:
 
     An existing target is replaced (see `check_target`). Nothing is left behind after an error.
     """
-    parent = target.absolute().parent
-    with explain_os_errors(f"{target} cannot be written"), staging(parent) as folder:
+    with explain_os_errors(f"{target} cannot be written"), publishing(target) as folder:
         # The file has its final name, because bags contain the name of their file.
         staged = folder / target.name
         yield staged
         if staged.is_dir():
             (staged / MARK_FILE).write_text("Written by lidarpool augment.\n")
-        if target.is_dir() or staged.is_dir():  # only files are replaced atomically
-            Storage.at(parent).discard(target.name)
-        staged.replace(target)
-        flush(parent)

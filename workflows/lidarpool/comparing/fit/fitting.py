@@ -16,7 +16,6 @@ import yaml
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import Storage
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_number
@@ -27,6 +26,7 @@ from lidarview.page_templates import render_template
 from ...clouds.recording import Recording
 from ...columns.parts import StoredCloud
 from ...recordings.opening import as_recording
+from ...work.publishing import publishing
 from .estimates import Estimate
 from .known_poses import KnownPoses
 from .measured import SensorMeasurement, measure_moving, measure_standing
@@ -68,12 +68,15 @@ class Fit:
         text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
         pictures = {"fit": draw_charts(self.figures).svg()}
         page = render_template("fit.html", __name__, report=self.figures, pictures=pictures)
-        contents = {model_path: text, model_path.with_suffix(".html"): page}
+        page_path = model_path.with_suffix(".html")
         advice = "choose an existing folder with enough free space"
-        with explain_os_errors(f"{model_path} cannot be written", advice):
-            for path, content in contents.items():
-                Storage.at(path.parent, durable=False).write(path.name, content.encode())
-        return [*contents]
+        with (
+            explain_os_errors(f"{model_path} cannot be written", advice),
+            publishing(model_path) as staged,
+        ):
+            (staged / model_path.name).write_bytes(text.encode())
+            (staged / page_path.name).write_bytes(page.encode())
+        return [model_path, page_path]
 
 
 def fit(

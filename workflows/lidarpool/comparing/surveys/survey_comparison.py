@@ -83,7 +83,7 @@ class SurveyComparison:
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.csv, compare.html and the maps, and return their paths.
 
-        The folder is created if it does not exist. Pictures of an earlier comparison are removed.
+        The folder is created if it does not exist. An earlier comparison is replaced.
 
         Raises
         ------
@@ -103,5 +103,4 @@ class SurveyComparison:
         report = render_template(
             "survey.html", __name__, report=self.figures, pictures=pictures, labels=LABELS
         )
-        texts = {"compare.csv": self.table()}
-        return write_comparison(folder, self.figures, report, pages, texts)
+        return write_comparison(folder, self.figures, report, pages, self.table())
