@@ -158,6 +158,20 @@ def test_a_path_passes_all_lines_at_their_times(scanner):
     assert steps == pytest.approx(plan.rates.speed_m_s, rel=0.02)
 
 
+@pytest.mark.parametrize("heights", [(300.0, 420.0), (420.0, 300.0)])
+def test_the_height_changes_smoothly_between_lines(heights):
+    """Between the lines, it follows 3 s² - 2 s³ of the share of the distance."""
+    speed_m_s = 60.0
+    first = FlightLeg(np.array([0.0, 0]), np.array([3000.0, 0]), np.full(4, heights[0]))
+    last = FlightLeg(np.array([3000.0, 900]), np.array([0.0, 900]), np.full(3, heights[1]))
+    path = fly([first, last], speed_m_s)
+    stop_s, start_s = path.starts_s[0] + path.durations_s[0], path.starts_s[1]
+    share = np.clip((path.times_s - stop_s) / (start_s - stop_s), 0, 1)
+    expected = heights[0] + (heights[1] - heights[0]) * (3 * share**2 - 2 * share**3)
+    np.testing.assert_allclose(path.positions[:, 2], expected, atol=0.05)
+    assert ((share > 0.1) & (share < 0.4)).sum() > 10
+
+
 def test_turns_are_as_short_as_possible():
     radius = turn_radius_m(30)
     half_circle = shortest_turn(np.zeros(2), 0.0, np.array([0, 2 * radius]), math.pi, radius)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool.reconstruction.moving_objects import find_tracks
+from lidarpool.reconstruction.moving_objects import _on_ground, find_tracks
 from lidarpool.reconstruction.moving_rays import MovingRays, box_distances
 from lidarpool.reconstruction.object_clusters import (
     ClusterTrack,
@@ -25,6 +25,7 @@ from lidarpool.reconstruction.object_surfels import (
 )
 from lidarpool.reconstruction.object_tracks import ObjectTrack, in_any_box, rotate_z
 from lidarpool.reconstruction.recorded_actors import actors_of, class_names
+from lidarpool.reconstruction.submap_objects import ObjectMap, ObjectTask
 from lidarpool.reconstruction.surface_map import Observations
 from lidarpool.reconstruction.surfels import Surfels, surfel_mesh
 
@@ -324,6 +325,68 @@ def test_holes_in_the_side_of_an_object_remain_and_the_rest_is_closed():
     assert np.isfinite(again.distance_m).mean() > 0.99
 
 
+@pytest.mark.parametrize("is_labeled", [True, False])
+def test_labeled_objects_keep_their_tracks_without_points(is_labeled):
+    """A box without any points is of no object, but its points are not of the scene."""
+    track, rays = box_sides()
+    apart = replace(track, number=6, positions=track.positions + np.array([40.0, 0, 0]))
+    found = ObjectMap.from_task(
+        ObjectTask(rays, [apart, track] if is_labeled else None, 0.1, 0.2, np.radians(0.5))
+    )
+    if is_labeled:
+        assert [one.number for one in found.tracks] == [6, 5]
+        assert [one.track.number for one in found.objects] == [5]
+    else:
+        assert len(found.tracks) == len(found.objects)
+    inside = found.between(np.array([0.35]))
+    assert len(inside.tracks) == len(found.tracks)
+
+
+def ground_around(track, heights, count=400):
+    """Return stationary returns around a box, in the frame of the box, and at its first time."""
+    random = np.random.default_rng(5)
+    x, y = random.uniform(-3.4, 3.4, (2, count))
+    beside = (np.abs(x) > 2) | (np.abs(y) > 1)
+    local = np.column_stack([x, np.clip(y, -1.9, 1.9), random.choice(heights, count)])[beside]
+    positions, yaw = track.poses(np.zeros(len(local)))
+    nothing = np.zeros(len(local), int)
+    return MovingRays(
+        nothing,
+        np.zeros(len(local)),
+        np.tile(SENSOR, (len(local), 1)),
+        positions + rotate_z(local, yaw),
+        np.ones(len(local), bool),
+        np.zeros(len(local), bool),
+        nothing,
+        np.full(len(local), np.nan),
+        nothing,
+        nothing - 1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("heights", "expected_m"),
+    [
+        ([-0.3], 0.3),  # the ground is below the lowest points
+        ([0.2], 0.0),  # a box is never raised
+        ([-0.3, 0.8], 0.3),  # a wall beside the object is not the ground
+        ([-0.3, -0.8], 0.3),  # neither is a ditch
+        ([-0.3, -0.3, -0.3, 0.3], 0.3),  # the ground is a low quantile
+    ],
+)
+def test_boxes_reach_the_ground_around_them(heights, expected_m):
+    at = np.array([4.0, -7.0, 1.5])
+    track = ObjectTrack(1, "", SIZE, np.array([0.0, 1]), at + np.zeros((2, 3)), np.full(2, 0.7))
+    found = _on_ground(track, ground_around(track, heights))
+    np.testing.assert_allclose(
+        (track.positions - found.positions)[1], [0, 0, expected_m], atol=1e-9
+    )
+    np.testing.assert_allclose(found.size - SIZE, [0, 0, expected_m], atol=1e-9)
+    # Too few returns do not determine it.
+    few = ground_around(track, heights)
+    assert _on_ground(track, few.select(slice(0, 19))) is track
+
+
 def plate(x, size=1.0, dark=False):
     """Return an upright square surfel at x that faces -x."""
     half = size / 2
@@ -403,9 +466,21 @@ def test_actors_are_named_and_numbered_by_kind_and_class():
 )
 def test_actors_are_present_from_their_first_to_their_last_time(stands, span_s, expected):
     one = standing(1, "Car")
-    one = replace(one, track=replace(one.track, stands_before=stands[0], stands_after=stands[1]))
-    (actor,) = actors_of([one], [one.surfels.mesh], {}, span_s, 0.1)
-    np.testing.assert_allclose(actor.times_s, [expected[0], 1.0, 2.0, expected[1]])
+    track = replace(
+        one.track,
+        times_s=np.array([1.0, 1.25, 2.0]),
+        positions=np.array([[1.0, 0, -1], [1.5, 0.5, -1], [3.0, 2, -1]]),
+        yaw=np.zeros(3),
+        stands_before=stands[0],
+        stands_after=stands[1],
+    )
+    (actor,) = actors_of([replace(one, track=track)], [one.surfels.mesh], {}, span_s, 0.1)
+    np.testing.assert_allclose(actor.times_s, [expected[0], 1.0, 1.25, 2.0, expected[1]])
+    # The object moves by (2, 2) m/s. If it is not stationary, it continues for half a period.
+    first = actor.positions[0] - track.positions[0]
+    last = actor.positions[-1] - track.positions[-1]
+    np.testing.assert_allclose(first, [0, 0, 0] if stands[0] else [-0.1, -0.1, 0], atol=1e-9)
+    np.testing.assert_allclose(last, [0, 0, 0] if stands[1] else [0.1, 0.1, 0], atol=1e-9)
 
 
 def test_labels_of_objects_without_returns_are_kept():

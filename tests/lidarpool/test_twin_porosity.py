@@ -41,6 +41,31 @@ def test_gap_fractions_are_the_share_of_the_rays_that_pass():
     assert (layers == 0).all(), "nothing is visible behind a dark surfel"
 
 
+@pytest.mark.parametrize("passing", [0, 24, 45])
+def test_few_rays_have_the_gaps_of_the_surfels_around(passing):
+    """In 20 places, 60 rays meet each of 8 surfels, and both rays to a ninth end on it."""
+    places, many = 20, 8
+    surfel = np.repeat(np.arange(places * many, dtype=np.int32), 60)
+    surfel = np.append(surfel, np.repeat(np.arange(places, dtype=np.int32), 2) + places * many)
+    ranges = np.tile(np.repeat([5.0, 12.0], [60 - passing, passing]), places * many)
+    range_m = np.append(ranges, np.full(2 * places, 5.0))
+    shape = (len(surfel), 1)
+    crossings = Crossings(surfel[:, None], np.full(shape, 5.0), np.zeros(shape, np.uint8), range_m)
+    y = np.add.outer(10.0 * np.arange(places), 0.1 * np.arange(many + 1))
+    y = np.append(y[:, :many].ravel(), y[:, many])
+    centers = np.column_stack([np.full(len(y), 5.0), y, 0 * y])
+    dark = np.zeros(len(y), bool)
+    found = Porosity.from_crossings([crossings], centers, dark, 0.15).gap_fraction
+    # The gaps of all surfels in a place, and 0.2 of 2.2 rays in addition, count as 2.2 rays.
+    nearby = (many * passing + 0.2) / (many * 60 + 2 + 2.2)
+    expected = (passing + 2.2 * nearby) / (60 + 2.2)
+    assert found[:-places].mean() == pytest.approx(expected, abs=0.005)
+    assert found[-places:].mean() == pytest.approx(2.2 * nearby / (2 + 2.2), abs=0.01)
+    dark[[3, -1]] = True
+    found = Porosity.from_crossings([crossings], centers, dark, 0.15).gap_fraction
+    assert not found[[3, -1]].any()
+
+
 def upright(name, y, height):
     """A wall along x."""
     corners = [(x, y, z) for x, z in ((-40, 0), (40, 0), (40, height), (-40, height))]

@@ -51,6 +51,22 @@ def test_each_sweep_of_a_drive_is_of_one_submap_and_sees_those_around():
     assert ((owners & near).sum(axis=0) == 1).all()
 
 
+def test_the_first_and_the_last_sweep_of_a_submap_own_the_points_beside_them():
+    """Each sweep is in a meter of its own, so that it decides alone where its submap ends."""
+    positions = straight(200, 1.5)
+    poses = np.tile(np.eye(4), (200, 1, 1))
+    poses[:, :3, 3] = positions
+    submaps = split_into_submaps(positions)
+    assert len(submaps) == 2
+    for submap in submaps:
+        own = submap.own_numbers
+        seen = submap.numbers
+        beside = positions[seen] + np.array([0.4, -9.0, 1.0])
+        expected = (seen >= own[0]) & (seen <= own[-1])
+        np.testing.assert_array_equal(submap.owns(beside, poses), expected)
+        assert not expected.all()
+
+
 def test_a_sensor_that_stands_for_long_is_one_submap_of_some_sweeps():
     random = np.random.default_rng(3)
     standing = random.normal(0, 0.02, (3000, 3))

@@ -118,6 +118,22 @@ def test_a_response_explains_intensities_at_other_ranges_and_incidences(model):
     assert np.shape(figures["by_ring"]) == (4, 11)
 
 
+@pytest.mark.parametrize("exponent", [0.4, 1.7, 2.5])
+@pytest.mark.parametrize("model", list(IntensityModel))
+def test_the_incidence_exponent_is_that_of_the_intensities(model, exponent):
+    rays, reflectance = observed(400)
+    intensity = 30 * reflectance * RINGS[rays.ring] * rays.cosine**exponent
+    if model is IntensityModel.ENERGIES:
+        intensity = intensity * (10 / rays.range_m) ** 2
+    response = fit_response(
+        [rays._replace(intensity=intensity)], 4, are_energies=model is IntensityModel.ENERGIES
+    )
+    assert response.model is model
+    assert response.incidence_exponent == pytest.approx(exponent, abs=0.1)
+    by_ring = response.by_ring[:, 4]
+    np.testing.assert_allclose(by_ring / by_ring.mean(), RINGS / RINGS.mean(), rtol=0.05)
+
+
 def test_only_energies_decrease_with_the_range():
     range_m = np.array([5.0, 10.0, 20.0])
     np.testing.assert_allclose(IntensityModel.ENERGIES.attenuation(range_m), [4, 1, 0.25])

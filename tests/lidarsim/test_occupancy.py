@@ -136,6 +136,28 @@ def test_surfaces_intersect_the_same_voxels_as_clipped_triangles():
             assert clipped(triangle, cell - 2e-6, cell + 1 + 2e-6)
 
 
+def test_voxels_have_the_squared_distance_of_the_closest_triangle():
+    """Beside triangles of any shape, some are lines or points."""
+    random = np.random.default_rng(8)
+    triangles = random.uniform(-1, 5, (30, 3, 3))
+    triangles[20:25, 2] = triangles[20:25, :2].mean(axis=1)
+    triangles[25:28, 2] = triangles[25:28, 0]
+    triangles[28:] = triangles[28:, :1]
+    found = np.full((4, 3, 5), -1, np.int32)
+    none = np.full(found.shape, -1, np.int32)
+    square = np.full(found.shape, 9e9)
+    numbers = np.arange(len(triangles), dtype=np.int32)
+    loops.add_surfaces(triangles, numbers, np.full_like(numbers, -1), none, found, square)
+    # The closest of many points of each triangle, at most a few millimeters from the closest one.
+    u, v = np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 201))
+    weights = np.stack([1 - u, u * (1 - v), u * v], axis=-1).reshape(-1, 3)
+    for cell in np.argwhere(found >= 0):
+        points = weights @ triangles[found[tuple(cell)]]
+        expected = ((points - cell - 0.5) ** 2).sum(axis=1).min()
+        assert square[tuple(cell)] == pytest.approx(expected, abs=0.01)
+    assert {*found.ravel().tolist()} & {*range(20, 28)}
+
+
 def clipped(polygon, lower, upper):
     """Whether a polygon has a part between two corners (Sutherland and Hodgman)."""
     polygon = list(polygon)
@@ -313,3 +335,10 @@ def test_following_sweeps_observe_more():
 def test_invalid_grids(arguments, words):
     with pytest.raises(LidarError, match=words):
         VoxelGrid(*arguments)
+
+
+def test_the_largest_grid():
+    assert VoxelGrid((-500, 0, -1), (0, 250, 1.5), 0.25).shape == (2000, 1000, 10)
+    assert VoxelGrid((-500, -200, 0), (0, 300, 400), 1).shape == (500, 500, 400)
+    with pytest.raises(LidarError, match="this one has 100,250,000"):
+        VoxelGrid((-500, -200, 0), (0, 300, 401), 1)

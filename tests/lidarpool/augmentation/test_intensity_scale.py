@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +14,12 @@ from tests.drives import SCANS, points_of, the_scene
 from tests.street_recordings import COUNT, record, reflectances, street
 
 from lidarpool import load_sensor
-from lidarpool.augmentation.intensity_fit import NearFactors, Quantization
+from lidarpool.augmentation.intensity_fit import (
+    NearFactors,
+    Quantization,
+    RecordedReturns,
+    is_compensated,
+)
 from lidarpool.augmentation.intensity_scale import IntensityScale
 from lidarpool.clouds.recording import Recording
 from lidarpool.recordings.opening import open_recording
@@ -332,6 +338,55 @@ def test_a_clear_drop_at_close_range_is_fitted_in_both_directions():
     assert without_drop.near == NearFactors()
 
 
+def returns_at(range_m, height_m):
+    return RecordedReturns({}, range_m, np.broadcast_to(height_m, range_m.shape))
+
+
+@pytest.mark.parametrize("height_m", [1.0, -2.0])
+@pytest.mark.parametrize("exponent", [0.0, -1.0, -2.0, -3.0])
+def test_the_law_of_intensities_is_found_beside_saturated_ranges(exponent, height_m):
+    """Values within 12 m are at the maximum, whatever the law is."""
+    range_m = np.linspace(5, 39, 4000)
+    values = np.minimum(200 * (12 / range_m) ** -exponent, 200)
+    values[range_m < 12] = 200
+    returns = returns_at(range_m, height_m)
+    if exponent:
+        assert is_compensated(values, returns, 200) == (exponent > -1.5)
+    else:
+        assert is_compensated(values, returns, 200) is None
+    if exponent > -3:
+        assert is_compensated(values, returns, 201) is True
+
+
+def test_factors_at_close_range_are_those_of_the_intervals():
+    edges = [1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0]
+    centers = (*(np.add(edges[:-2], edges[1:-1]) / 2).tolist(), 10.0)
+
+    def near(factors, count=200, height_m=(0.5, -1.8)):
+        """Fit factors to as many returns in each interval, from the ground and above it."""
+        parts = [np.linspace(a, b, count, endpoint=False) for a, b in pairwise(edges)]
+        range_m = np.tile(np.concatenate(parts), 2)
+        levels = 0.3 * np.tile(np.repeat([*factors, 1.0], count), 2)
+        heights = np.repeat(height_m, len(range_m) // 2)
+        return NearFactors.from_returns(levels, returns_at(range_m, heights))
+
+    drop = [0.2, 0.3, 0.6, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0]
+    fitted = near(drop)
+    assert fitted.range_m == centers
+    assert fitted.factors == pytest.approx((*drop, 1.0))
+    np.testing.assert_allclose(fitted.at([0.1, 1.5, 9.0, 99.0]), [0.2, 0.25, 1, 1])
+    # Two intervals with a drop are not clear, factors never decrease, and have a minimum.
+    assert near([0.2, 0.6, *[1.0] * 7]) == NearFactors()
+    assert near([0.2, 0.6, 0.71, *[1.0] * 6]) == NearFactors()
+    assert near([0.5, 0.9, 0.4, *[0.6] * 6]).factors == pytest.approx([0.4] * 3 + [0.6] * 6 + [1])
+    assert near([0.01, 0.2, 0.3, *[1.0] * 6]).factors[0] == 0.05
+    # Fewer than 200 returns from the ground do not show a drop.
+    assert near(drop, count=199) == NearFactors()
+    assert near(drop, height_m=(0.5, 0.5)) == NearFactors()
+    # Returns of the ground are at its height: what is 0.4 m higher or lower is not.
+    assert near(drop, height_m=(-1.8, -1.8)).factors == pytest.approx((*drop, 1.0))
+
+
 # -- recorded values -------------------------------------------------------------------------
 
 
@@ -442,7 +497,13 @@ def test_continuous_values_survive_a_round_trip(value, distance, dtype, compensa
         (np.arange(200, dtype=np.float32) / np.float32(255), (255, 1)),
         (np.arange(200, dtype=np.float32) / np.float32(256), (256, 255 / 256)),
         (np.arange(100, dtype=np.float32) / np.float32(100), (100, 0.99)),
+        (np.arange(101, dtype=np.float32) / np.float32(100), (100, 1)),
+        (np.arange(257, dtype=np.float32) / np.float32(256), (256, 1)),
+        (np.arange(300, dtype=np.float32) / np.float32(256), (256, np.inf)),
         (np.round(np.linspace(0, 3, 999), 3), (1000, np.inf)),
+        (np.append(np.linspace(0, 1.2, 99) ** 2.1, [7.0] * 5), (0, 7)),
+        (np.append(np.linspace(0, 1.2, 99) ** 2.1, [7.0] * 4), (0, np.inf)),
+        (np.append(np.linspace(0, 1.2, 99) ** 2.1, [7.125] * 5), (0, np.inf)),
         (np.linspace(0, 1, 999) ** 2.1, (0, np.inf)),
         (np.minimum(np.linspace(0, 1.2, 999) ** 2.1, 1), (0, 1)),
     ],

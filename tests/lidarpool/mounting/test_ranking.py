@@ -122,6 +122,15 @@ def test_sensors_add_points_and_the_lowest_of_them_sees_a_cell():
     assert one.detection["car"] == 0.5 and one.redundancy["car"] == 0
 
 
+def test_the_required_number_of_points_is_sufficient():
+    lowest = np.zeros((2, 4))
+    found = evaluated(top=result([10, 9, 4, 3, 5], lowest), low=result([10, 0, 4, 0, 3], lowest))
+    assert found.detection["car"] == 0.5 and found.detection["cone"] == pytest.approx(2 / 3)
+    one = evaluated(top=result([10, 9, 4, 3, 5], lowest))
+    assert one.detection["car"] == 0.5 and one.detection["cone"] == pytest.approx(2 / 3)
+    assert found.redundancy["car"] == 0.5 and found.redundancy["cone"] == pytest.approx(1 / 3)
+
+
 def test_candidates_are_sorted_by_score_then_blind_area_then_points():
     weightless = RULES._replace(blind_weight=0.0)
     names = ["worse", "blind", "few", "best", "same"]
