@@ -42,6 +42,7 @@ from .internals.method_rules import (
 )
 from .internals.names import FENCES, require_feature
 from .internals.scheduler import admit_other_tasks
+from .limits import memory_of
 
 logger = logging.getLogger(__name__)
 
@@ -157,8 +158,8 @@ class Fences(SchedulerPlugin):
         elapsed_s = time.monotonic() - self._warned_at
         if elapsed_s < WARN_EVERY_S or not self.keeps_out(task):
             return
-        if self.scheduler.valid_workers(task):  # it waits for a slot of another partition
-            return
+        if memory_of(task) or self.scheduler.valid_workers(task):
+            return  # it waits for a slot, or for memory, of another partition
         if not workers_without_fences(self.scheduler, task):  # it would wait without fences, too
             return
         self._warned_at = time.monotonic()

@@ -3,9 +3,9 @@
 A client registers with the scheduler before its first task for a partition (`register`). From then
 on, features such as inheritance are enabled in the partition (see `features.py`), and a rule checks
 each graph of the client when it arrives. Tasks fail with a `PoolError` if their partition was
-dissolved, if they request more slots than any worker of the partition has, or if they name a worker
-outside the partition. Without this check, they would wait forever. Tasks of clients that are not
-registered are not checked.
+dissolved, if they request more slots or memory than any worker of the partition has, or if they
+name a worker outside the partition. Without this check, they would wait forever. Tasks of clients
+that are not registered are not checked.
 
 The check runs on the scheduler because only the scheduler knows the current members. A client would
 have to wait for the response of a busy scheduler, and the response could be outdated when it
@@ -27,6 +27,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dask.utils import format_bytes
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
@@ -36,8 +37,9 @@ from .features import disable_features, enable_features, names_with_features, wa
 from .internals.method_rules import MethodRules, add_arrival_rule
 from .internals.names import REFUSING, require_feature
 from .internals.partition_client import CLIENT_OF
-from .internals.placing import has_worker_for, workers_declaring
+from .internals.placing import has_worker_for, memory_limit, workers_declaring
 from .internals.worker import current_task
+from .limits import MEMORY
 from .registration import is_registered, record_registration
 from .rules import check_name
 from .shares import slot_use
@@ -211,12 +213,13 @@ class Registrations(SchedulerPlugin):
         """
         annotations = graph["global_annotations"] or {}
         client = graph["client"]
+        memory = annotations.get(MEMORY, 0)
         for resources in graph["annotations_by_type"].get("resources", {}).values():
-            self._refuse(client, resources)
+            self._refuse(client, resources, memory)
         resources = annotations.get("resources")
         if not isinstance(resources, dict):  # None or a callable
             return graph
-        self._refuse(client, resources)
+        self._refuse(client, resources, memory)
         if not annotations.get("workers"):
             return graph
         return {**graph, "global_annotations": self._with_members(annotations)}
@@ -248,8 +251,8 @@ class Registrations(SchedulerPlugin):
         addresses = addresses_of_members(self.scheduler, name, names_of_workers)
         return {**annotations, "workers": addresses + hosts}
 
-    def _refuse(self, client: str, resources: Mapping[str, Any]) -> None:
-        """Raise PoolError if a client's tasks with these resources could never run."""
+    def _refuse(self, client: str, resources: Mapping[str, Any], memory: int) -> None:
+        """Raise PoolError if a client's tasks that request this could never run."""
         partitions = [name for name in resources if client in self.clients.get(name, ())]
         if partitions and len(resources) > 1:
             self._refuse_two_partitions(resources)
@@ -262,6 +265,8 @@ class Registrations(SchedulerPlugin):
                 )
             divided_on = str(self.scheduler.id) if name in self.with_rule else ""
             objection = rejection_reason(self.scheduler, name, slots, divided_on)
+            if not objection and memory:
+                objection = memory_objection(self.scheduler, name, slots, memory)
             if objection:
                 raise PoolError(objection)
 
@@ -434,6 +439,36 @@ def rejection_reason(scheduler: Any, name: str, slots: float, divided_on: str) -
         f"A task requests {slots:g} slots on one worker, but workers of partition {name!r} have "
         f"at most {max_slots:g}. Request fewer slots, or increase the slots per worker with "
         f'`slots={slots:g}` in the rule or with `--resources "{name}={slots:g}"`.'
+    )
+
+
+def memory_objection(scheduler: Any, name: str, slots: float, memory: int) -> str:
+    """Return why no worker of a partition could run a task with so much memory, or "".
+
+    Members that are restarting count. If there are no members with enough slots, the task waits.
+    """
+    limits = [
+        memory_limit(worker)
+        for worker in workers_declaring(scheduler, name)
+        if worker.resources[name] >= slots
+    ]
+    steward: Steward | None = scheduler.plugins.get(STEWARD)
+    if steward is not None:
+        limits += [r.info.memory for r in steward.members(name) if r.slots >= slots]
+    if not limits or memory <= max(limits):
+        return ""
+    workers = f"the workers of partition {name!r}"
+    if slots > 1:
+        workers = f"those workers of partition {name!r} that have {slots:g} slots"
+    if not any(limits):
+        return (
+            f"A task requests {format_bytes(memory)} of memory, but {workers} have no memory "
+            "limit. Start them with one, for example with `--memory-limit`, or remove `memory`."
+        )
+    return (
+        f"A task requests {format_bytes(memory)} of memory on one worker, but {workers} have at "
+        f"most {format_bytes(max(limits))}. Request less, or increase the memory limit of the "
+        "workers."
     )
 
 

@@ -33,7 +33,7 @@ from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
 from .internals.names import CANCELLING, CLIENTS, MAP, require_feature
 from .internals.partition_client import PartitionClient, entered_partitions, whole_client
-from .limits import timeout_annotation
+from .limits import limit_annotations
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
@@ -215,6 +215,7 @@ class Partition:
         slots: int = 1,
         workers: str | int | Sequence[str | int] | None = None,
         timeout_s: float | None = None,
+        memory: str | float | None = None,
         **kwargs: Any,
     ) -> Future:
         """Submit a task to this partition's workers.
@@ -247,18 +248,25 @@ class Partition:
             within 5 s, for example because it does not check `cancelled`, its worker is restarted
             under the conditions of ``cancel(running="restart")``. The restart waits up to a minute
             for other tasks on the worker to finish.
+        memory
+            Memory that the task holds on its worker while it runs, as a string such as "2 GiB" or
+            as a number of bytes. The tasks on a worker hold at most its memory limit in total, so
+            the task waits until a worker has enough. Workers without a memory limit do not run
+            the task. While the task waits for nested tasks, they can use its memory. The memory
+            that the task really uses is not limited.
 
         Returns
         -------
         Future
             Its `result` method raises `PoolError` if the partition was dissolved, if none of its
-            workers has enough slots, or if a worker in `workers` belongs to another partition. If
-            the partition has no workers, the task waits for one.
+            workers has enough slots and memory, or if a worker in `workers` belongs to another
+            partition. If the partition has no workers, the task waits for one.
 
         Raises
         ------
         ValueError
-            If `slots` is below 1, or if `timeout_s` is not positive.
+            If `slots` is below 1, if `timeout_s` or `memory` is not positive, or if `memory` has
+            no valid unit.
         PoolError
             If the function is a coroutine function, or if a Dask option is passed that the
             partition sets itself. The client's first call waits for a
@@ -282,7 +290,9 @@ class Partition:
                 )
             # Names are converted to strings, because LocalCluster uses integers.
             workers = [MemberName(name) for name in several]
-        annotations: dict[str, Any] = timeout_annotation(timeout_s)
+        annotations = limit_annotations(timeout_s, memory)
+        if memory is not None and (kwargs.get("actor") or kwargs.get("actors")):
+            raise PoolError("An actor cannot hold memory. Remove `memory`, or submit a task.")
         if pipes := _names_of_pipes([*args, *kwargs.values()]):
             annotations[USES_PIPES] = pipes
         with dask.annotate(**annotations) if annotations else nullcontext():
@@ -329,6 +339,7 @@ class Partition:
         return_exceptions: bool = False,
         empty_s: float = WAIT_S,
         timeout_s: float | None = None,
+        memory: str | float | None = None,
         setup: Callable[[], Any] | None = None,
         **kwargs: Any,
     ) -> Results:
@@ -378,6 +389,9 @@ class Partition:
         timeout_s
             Maximum running time of each item in seconds, as in `submit`. Each task then has one
             item, as with ``chunk=1``.
+        memory
+            Memory that each task holds on its worker, as in `submit`. The items of a task are
+            processed one after another, so it is the memory for one item, plus the results.
         setup
             Function without arguments, such as a function that loads a model. It is called once in
             each worker process, when the process runs the first task of the map, and `function`
@@ -407,7 +421,8 @@ class Partition:
         ------
         ValueError
             If `window`, `chunk` or `slots` is below 1, if `retries` or `empty_s` is below 0, if
-            `timeout_s` is not positive, or if it is combined with a `chunk` above 1.
+            `timeout_s` or `memory` is not positive, or if `timeout_s` is combined with a `chunk`
+            above 1.
         PoolError
             If the partition was dissolved, if `function` or `setup` is a coroutine function, or if
             `pure` or `resources` is passed.
@@ -443,7 +458,7 @@ class Partition:
             keywords=kwargs,
             by_rule=self.by_rule,
             empty_s=empty_s,
-            annotations=timeout_annotation(timeout_s),
+            annotations=limit_annotations(timeout_s, memory),
             setup=StageSetup.from_user_value(setup),
         )
         return Results(stage, iterables)
@@ -483,6 +498,7 @@ class Partition:
         slots: int = 1,
         empty_s: float = WAIT_S,
         timeout_s: float | None = None,
+        memory: str | float | None = None,
         setup: Callable[[], Any] | None = None,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
@@ -510,7 +526,7 @@ class Partition:
             Maximum number of tasks in flight. By default, it is two for each slot outside the
             share of other clients, and increases to up to 16 for each slot if slots become idle
             before this process can submit further tasks. It adapts to the number of slots.
-        priority, retries, slots, timeout_s
+        priority, retries, slots, timeout_s, memory
             Options of each task, as in `submit`.
         empty_s
             Maximum time in seconds that tasks wait while the partition has no workers, as in `map`.
@@ -549,9 +565,9 @@ class Partition:
         >>> casting.result()                                             # doctest: +SKIP
         36
         """
-        timeout_annotation(timeout_s)  # raises an error here rather than in a thread
+        limit_annotations(timeout_s, memory)  # raises an error here rather than in a thread
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
-        options["timeout_s"] = timeout_s
+        options |= {"timeout_s": timeout_s, "memory": memory}
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._resources_for(slots)
@@ -638,7 +654,14 @@ class Partition:
 
     # -- collections and data ----------------------------------------------------------
 
-    def compute(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
+    def compute(
+        self,
+        collections: Any,
+        *,
+        slots: int = 1,
+        memory: str | float | None = None,
+        **options: Any,
+    ) -> Any:
         """Compute Dask collections, such as arrays, dataframes, bags, or delayed values.
 
         Each task of a collection occupies a slot. Rechunking and shuffling also stay on these
@@ -651,6 +674,8 @@ class Partition:
             Collection, or a list of collections.
         slots
             Number of slots that each task occupies.
+        memory
+            Memory that each task holds on its worker, as in `submit`.
         options
             Further options of `Client.compute`, such as ``sync=True`` to return the result instead
             of a future. To keep results on these workers, use ``with partition:`` and ``persist``.
@@ -667,7 +692,10 @@ class Partition:
         1000000000.0
         """
         _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
-        return self.client.compute(collections, resources=self._resources_for(slots), **options)
+        annotations = limit_annotations(None, memory)
+        resources = self._resources_for(slots)
+        with dask.annotate(**annotations) if annotations else nullcontext():
+            return self.client.compute(collections, resources=resources, **options)
 
     def as_client(self) -> Client:
         """Return a client that only uses and shows the workers of this partition.

@@ -6,13 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 
+from dask.utils import format_bytes
+
 from .html_table import format_seconds, html_table, text_table
 from .rules import format_workers
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
-_HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
+HEAD_OF_COUNTS = (*COUNTS, "seconds", "peak memory")
+_HEAD_OF_STAGES = ("stage", *HEAD_OF_COUNTS)
 NO_PARTITION = "no partition"  # label for workers without a partition and for plain Dask tasks
-_HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
+_HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *HEAD_OF_COUNTS)
 HEAD_OF_CLIENTS = ("client", "weight", "share", "slots", "waiting", "wait", "seconds")
 HEAD_OF_QUEUES = ("partition", "waiting jobs of others", "jobs being released", "state")
 
@@ -134,6 +137,12 @@ class StageStats:
         Number of times that a worker died while it was running a task, as far as the scheduler
         knows. Dask runs these tasks again. Finished results that are lost are not counted. A task
         that Dask stops retrying after too many workers have died is counted as failed instead.
+    peak_memory
+        Highest memory usage of a worker process (its resident set size) in bytes while it was
+        running a task of the stage, or 0 if it was not measured. It is sampled ten times a second
+        and when a task ends, and includes everything in the process: libraries, stored results, and
+        other tasks that run at the same time. In a process with several workers, it includes all of
+        them. For a partition, it is the maximum of all stages.
     """
 
     waiting: int = 0
@@ -145,14 +154,19 @@ class StageStats:
     queued_seconds: float = 0.0
     lost: int = 0
     pipe_seconds: float = 0.0
+    peak_memory: int = 0
 
     def _repr_html_(self) -> str:
-        return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])
+        return html_table(type(self).__name__, HEAD_OF_COUNTS, [self.cells])
 
     @property
-    def _figures(self) -> list[object]:
-        """Table cells with the number of tasks in each state, and the running time in seconds."""
-        return [*(getattr(self, count) for count in COUNTS), format_seconds(self.seconds)]
+    def cells(self) -> list[object]:
+        """Table cells in the order of the columns, after the name of the stage."""
+        return [
+            *(getattr(self, count) for count in COUNTS),
+            format_seconds(self.seconds),
+            format_bytes(self.peak_memory) if self.peak_memory else "–",
+        ]
 
 
 @dataclass(frozen=True, repr=False)
@@ -200,21 +214,21 @@ class PartitionStats(StageStats):
     def __repr__(self) -> str:
         size = describe_size(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
-        stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
+        stages = [[stage, *stats.cells] for stage, stats in self.stages.items()]
         lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""
         queue = f", {self.queue}" if self.queue else ""
         title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}{queue}>"
-        tables = [text_table(_HEAD_OF_STAGES, [*stages, ["all", *self._figures]])]
+        tables = [text_table(_HEAD_OF_STAGES, [*stages, ["all", *self.cells]])]
         if len(self.clients) > 1:
             tables.append(text_table(HEAD_OF_CLIENTS, self._client_rows))
         return "\n".join([title, *tables])
 
     def _repr_html_(self) -> str:
         name = self.name or NO_PARTITION
-        row = [name, self.workers, self.slots, self.busy, *self._figures]
+        row = [name, self.workers, self.slots, self.busy, *self.cells]
         tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])
         if self.stages:
-            stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
+            stages = [[stage, *stats.cells] for stage, stats in self.stages.items()]
             tables += html_table("Stages", _HEAD_OF_STAGES, stages)
         if len(self.clients) > 1:
             tables += html_table("Clients", HEAD_OF_CLIENTS, self._client_rows)

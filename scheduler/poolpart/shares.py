@@ -18,6 +18,12 @@ worker (see `extras.lending`). Therefore, one nested task more than there are sl
 to the worker of the task that has submitted it. The same applies to tasks that are bound to
 workers, because they could not use a slot of another worker in the meantime. These are called tied
 tasks in this module.
+
+A task with the annotation `MEMORY` is only assigned to a worker whose other assigned tasks leave
+enough of its memory limit. If the task whose turn it is needs more memory than is free, the worker
+with the most free memory is reserved: other tasks that hold memory are not assigned to it until
+the first one is. The memory of a task that has lent its slots can only be used by nested tasks. All
+of this is part of the scheduler's `valid_workers`, so that it also applies to tasks that are moved.
 """
 
 from __future__ import annotations
@@ -43,10 +49,17 @@ from .internals.held_tasks import (
     priority_of_waiting,
     refresh_waiting_times,
 )
-from .internals.method_rules import MethodRules
+from .internals.method_rules import MethodRules, workers_without_fences
 from .internals.names import SHARES, require_feature
-from .internals.placing import can_run, earliest_worker, holders_of_inputs, workers_declaring
-from .internals.scheduler import SUBMITTER, SubmittingTask
+from .internals.placing import (
+    can_run,
+    earliest_worker,
+    holders_of_inputs,
+    memory_limit,
+    workers_declaring,
+)
+from .internals.scheduler import SUBMITTER, SubmittingTask, is_moving
+from .limits import memory_of
 from .partition_stats import ClientStats
 from .share_policy import SharePolicy, has_room
 
@@ -63,6 +76,12 @@ class _Bounds(NamedTuple):
     is_tied: bool = False  # whether the task is nested or bound to workers
     workers: frozenset[str] | None = None
     hosts: frozenset[str] | None = None
+    memory: int = 0  # memory that it holds, in bytes
+
+    @property
+    def is_restricted(self) -> bool:
+        """Whether some workers of the partition may not be valid."""
+        return bool(self.workers or self.hosts or self.memory)
 
 
 _ANY_WORKER = _Bounds()
@@ -86,17 +105,20 @@ class _Assignment:
     slots: float
     seconds: float  # expected slot time
     is_tied: bool
+    memory: int = 0  # in bytes
     is_lent: bool = False
 
 
 @dataclass(slots=True)
 class _Load:
-    """Slots that the assigned tasks of a worker request."""
+    """Slots and memory that the assigned tasks of a worker request."""
 
     used: float = 0.0
     tied: float = 0.0  # slots that tied tasks request, which are included in `used`
     seconds: float = 0.0  # expected slot time of the tasks
     free: float = 0.0  # number of slots without a task
+    memory: int = 0  # in bytes, without tasks that have lent their slots
+    lent_memory: int = 0  # in bytes, of tasks that have lent their slots
 
 
 @dataclass
@@ -113,6 +135,8 @@ class PartitionQueue:
     loads: dict[Any, _Load] = field(default_factory=dict)  # by worker
     # Workers that have room for a task, starting with the one that has had room the longest.
     with_room: dict[Any, None] = field(default_factory=dict)
+    # Worker whose memory is reserved for a held task, and the key of the task.
+    reserved: tuple[Any, Any] | None = None
     tied_held: int = 0  # number of tied tasks among `held`
     free_slots: float = 0.0  # number of slots without a task
     _idle_s: float = 0.0  # time until the last change for which slots had no task, times slots
@@ -166,30 +190,31 @@ class PartitionQueue:
 
     def unassign(self, key: Any) -> None:
         """Remove a task from the load of its worker."""
-        assignment = self.assigned.pop(key)
-        if not assignment.is_lent:
-            self._add_load(assignment, -1)
+        self._add_load(self.assigned.pop(key), -1)
 
     def set_lent(self, key: Any, lent: bool) -> None:
         """Record that a task has lent its slots, or has them back."""
         assignment = self.assigned.get(key)
         if assignment is not None and assignment.is_lent != lent:
+            self._add_load(assignment, -1)
             assignment.is_lent = lent
-            self._add_load(assignment, -1 if lent else 1)
+            self._add_load(assignment, 1)
 
     def move(self, key: Any, worker: Any) -> None:
         """Record that an assigned task was moved to another worker."""
         assignment = self.assigned[key]
-        if not assignment.is_lent:
-            self._add_load(assignment, -1)
+        self._add_load(assignment, -1)
         assignment.worker = worker
-        if not assignment.is_lent:
-            self._add_load(assignment, 1)
+        self._add_load(assignment, 1)
 
     def _add_load(self, assignment: _Assignment, sign: int) -> None:
         load = self.loads.get(assignment.worker)
         if load is None:
             load = self.loads[assignment.worker] = _Load()
+        if assignment.is_lent:
+            load.lent_memory += sign * assignment.memory
+            return
+        load.memory += sign * assignment.memory
         load.used += sign * assignment.slots
         load.seconds += sign * assignment.seconds
         if assignment.is_tied:
@@ -212,6 +237,8 @@ class PartitionQueue:
         held = self.held.pop(key, None)
         if held is not None:
             self.tied_held -= held.bounds.is_tied
+            if self.reserved is not None and self.reserved[1] == key:
+                self.reserved = None
             if not self.held:
                 self.heaps.clear()  # entries of canceled tasks would remain
         return held
@@ -250,6 +277,8 @@ class Shares(SchedulerPlugin):
         self._clients: dict[Any, str] = {}  # {task key: name of its client}
         self._assigned_in: dict[Any, PartitionQueue] = {}  # {task key: queue of its partition}
         self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
+        # {task with memory: worker to which it may be moved}
+        self._moves: dict[Any, Any] = {}
         self._numbers = itertools.count()  # numbers of assignments
         self._check: asyncio.TimerHandle | None = None
         self._is_dispatch_due = False  # whether a dispatch is scheduled
@@ -267,6 +296,8 @@ class Shares(SchedulerPlugin):
                 choose=self.choose,
                 is_held=self._is_held,
                 admit=self._admit,
+                restrict=self._with_memory,
+                record_move=self._record_move,
             )
         queue = self.queues[name] = PartitionQueue(name)
         for client, weight in self.weights.items():
@@ -471,16 +502,15 @@ class Shares(SchedulerPlugin):
         )
         is_tied = bool(task.worker_restrictions) or submitter_of(task) is not None
         seconds = slots * charge.expected_s
-        queue.assign(task.key, _Assignment(worker, slots, seconds, is_tied))
+        queue.assign(task.key, _Assignment(worker, slots, seconds, is_tied, memory_of(task)))
         self._assigned_in[task.key] = queue
         task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))
 
     def _worker_for(self, queue: PartitionQueue, task: Any, bounds: _Bounds) -> Any:
         """Return a worker that has room for a task, or None."""
         slots = task.resource_restrictions[queue.name]
-        if bounds.workers is None and bounds.hosts is None:
-            allowed = None
-        else:
+        allowed = None
+        if bounds.is_restricted:
             allowed = self.scheduler.valid_workers(task) or ()
         if queue.with_room:
             worker = self._worker_with_room(queue, task, slots, allowed)
@@ -532,6 +562,63 @@ class Shares(SchedulerPlugin):
                 return worker
         return None
 
+    # -- memory ------------------------------------------------------------------------
+
+    def _with_memory(self, valid: Any, task: Any) -> Any:
+        """Return the valid workers of a task that have enough memory for it."""
+        memory = memory_of(task)
+        queue = self._queue_of(task) if memory else None
+        if queue is None:
+            return valid
+        self._settle_moves()
+        is_nested = submitter_of(task) is not None
+        valid = {worker for worker in valid if memory <= self._free_memory(worker, is_nested)}
+        if queue.reserved is not None and not is_nested:
+            worker, key = queue.reserved
+            if key != task.key:
+                valid.discard(worker)
+        return valid
+
+    def _free_memory(self, worker: Any, is_nested: bool) -> int:
+        """Return the memory in bytes that a task could hold on a worker now."""
+        free = memory_limit(worker)
+        for queue in self.queues.values():
+            if (load := queue.loads.get(worker)) is not None:
+                free -= load.memory
+                if not is_nested:
+                    free -= load.lent_memory
+        if self._moves:
+            free -= sum(memory_of(task) for task, to in self._moves.items() if to is worker)
+        return free
+
+    def _record_move(self, result: Any, task: Any, victim: Any, target: Any) -> Any:
+        """Record that a worker was asked to give up a task with memory to another worker."""
+        if memory_of(task):
+            self._moves[task] = target
+        return result
+
+    def _settle_moves(self) -> None:
+        """Account for the moves that workers have confirmed or rejected."""
+        for task in [task for task in self._moves if not is_moving(self.scheduler, task)]:
+            del self._moves[task]
+            queue = self._assigned_in.get(task.key)
+            if queue is not None and task.processing_on is not None:
+                queue.move(task.key, task.processing_on)
+
+    def _reserve_memory(self, queue: PartitionQueue, task: Any, memory: int) -> None:
+        """Keep the memory of a worker for a task, unless another task has precedence."""
+        if queue.reserved is not None or submitter_of(task) is not None:
+            return
+        slots = task.resource_restrictions[queue.name]
+        workers = [
+            worker
+            for worker in workers_without_fences(self.scheduler, task)
+            if memory_limit(worker) >= memory and can_run(self.scheduler, worker, queue.name, slots)
+        ]
+        if workers:
+            best = max(workers, key=lambda worker: self._free_memory(worker, False))
+            queue.reserved = best, task.key
+
     # -- dispatching -------------------------------------------------------------------
 
     def _dispatch_soon(self) -> None:
@@ -550,6 +637,7 @@ class Shares(SchedulerPlugin):
     def _dispatch_from(self, queue: PartitionQueue) -> None:
         chosen: list[Any] = []
         while queue.held and (queue.with_room or queue.tied_held):
+            queue.reserved = None
             found = self._next_task(queue)
             if found is None:
                 break
@@ -573,6 +661,8 @@ class Shares(SchedulerPlugin):
                 if worker is not None:
                     in_turn = worker in queue.with_room
                     return held, worker, passed_over if in_turn else []
+                if held.bounds.memory:
+                    self._reserve_memory(queue, held.task, held.bounds.memory)
             passed_over.append(client)
         return None
 
@@ -614,12 +704,14 @@ class Shares(SchedulerPlugin):
 def _bounds_of(task: Any) -> _Bounds:
     workers, hosts = task.worker_restrictions, task.host_restrictions
     is_tied = bool(workers) or submitter_of(task) is not None
-    if not (is_tied or hosts):
+    memory = memory_of(task)
+    if not (is_tied or hosts or memory):
         return _ANY_WORKER
     return _Bounds(
         is_tied,
         frozenset(workers) if workers else None,
         frozenset(hosts) if hosts else None,
+        memory,
     )
 
 

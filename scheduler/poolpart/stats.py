@@ -25,6 +25,7 @@ from .steward import target_of
 from .task_table import MAX_ENDED_TASKS, TaskRow, to_datetime
 
 NAME = "poolpart-stats"
+PEAKS = "poolpart-peaks"  # topic of events about the peak memory of stages
 _ERROR_LETTERS = 200  # maximum length of the error of a task
 _MAX_EXAMINED = 1000  # number of tasks per worker that are searched for running tasks
 _RUNNABLE = {"processing", "queued", "no-worker"}  # states of tasks whose inputs are available
@@ -88,6 +89,12 @@ class TaskStatistics(SchedulerPlugin):
         task = self.scheduler.tasks.get(key)
         if task is not None:
             self.ended[partition_of(task), task.prefix.name]["pipe_seconds"] += seconds  # type: ignore[assignment]
+
+    def log_event(self, topic: str, msg: Any) -> None:
+        """Record the memory of a worker process that runs a stage."""
+        if topic == PEAKS:
+            counts = self.ended[msg["partition"], msg["stage"]]
+            counts["peak_memory"] = max(counts["peak_memory"], msg["bytes"])
 
     def queued_since(self, key: Any) -> float | None:
         """Return when a task became ready to run, or None if this is unknown.
@@ -289,10 +296,11 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 runs = min(running[stage], counts["assigned"])
                 queued = counts["queued"] + counts["assigned"] - runs
                 stages[stage] = StageStats(counts["waiting"], queued, runs, **ended)
-        sums = {
+        sums: dict[str, Any] = {
             count: sum(getattr(stage, count) for stage in stages.values())
             for count in StageStats.__dataclass_fields__
         }
+        sums["peak_memory"] = max((stage.peak_memory for stage in stages.values()), default=0)
         answers.append(
             PartitionStats(
                 name=name,

@@ -74,12 +74,12 @@ def test_a_pipe_shows_its_depth_capacity_and_state(pool):
 
 def test_statistics_are_tables_of_a_partition_and_of_its_stages(pool):
     part, _ = pool.partition("CPU", workers=["b"])
-    assert rows_of(part.stats()._repr_html_()) == {"CPU": ["1", "2", *"000000", "–"]}
+    assert rows_of(part.stats()._repr_html_()) == {"CPU": ["1", "2", *"000000", "–", "–"]}
     pool.client.gather([part.submit(pow, 2, n) for n in range(3)])
     stats = part.stats()
     rows = rows_of(stats._repr_html_())
-    assert rows["CPU"][:-1] == ["1", "2", "0", "0", "0", "0", "3", "0"]
-    assert rows["pow"][:-1] == ["0", "0", "0", "3", "0"]
+    assert rows["CPU"][:-2] == ["1", "2", "0", "0", "0", "0", "3", "0"]
+    assert rows["pow"][:-2] == ["0", "0", "0", "3", "0"]
     assert "<td" in stats.stages["pow"]._repr_html_()
 
 

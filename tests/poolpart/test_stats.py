@@ -202,7 +202,9 @@ def test_statistics_are_printed_as_a_table(client):
     assert re.fullmatch(
         r"<PartitionStats 'A': 1 worker, 2 slots, 0 busy, counted since [\d:]{8} UTC>", title
     )
-    assert head.split() == ["stage", "waiting", "queued", "running", "done", "failed", "seconds"]
+    assert head.split() == [
+        *("stage", "waiting", "queued", "running", "done", "failed", "seconds", "peak", "memory")
+    ]
     assert [row.split()[:6] for row in rows] == [
         ["after", "0", "0", "0", "3", "0"],
         ["all", "0", "0", "0", "3", "0"],

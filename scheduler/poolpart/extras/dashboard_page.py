@@ -22,16 +22,15 @@ from ..balancing import MAX_MOVES, recent_moves
 from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..fence import fence_names
-from ..html_table import TEXT_COLUMNS, format_seconds
+from ..html_table import TEXT_COLUMNS
 from ..internals.names import PAGE, require_feature
 from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
 from ..partition_stats import (
-    COUNTS,
     HEAD_OF_CLIENTS,
+    HEAD_OF_COUNTS,
     HEAD_OF_QUEUES,
     NO_PARTITION,
-    StageStats,
 )
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
@@ -96,7 +95,6 @@ th { font-weight: 400; color: #667; }
 {% end %}</tr>
 {% end %}</table>
 {% end %}{% end %}""")
-_FIGURES = (*COUNTS, "seconds")
 _OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "status", "address")
 
 
@@ -116,8 +114,8 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     pipes: list[list[object]] = []
     for p in stats_of(shown, scheduler):
         title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
-        partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
-        stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+        partitions.append([title, p.workers, p.slots, p.busy, *p.cells])
+        stages += [[name, _label(p.name), *stage.cells] for name, stage in p.stages.items()]
         clients += [[client, _label(p.name), *stats.cells] for client, stats in p.clients.items()]
         if p.queue:
             queues.append([p.name, *p.queue.cells])
@@ -130,8 +128,8 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     if only:
         moves = [move for move in moves if only in (move.source, move.destination)]
     tables = [
-        ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
-        ("Stages", ["stage", "partition", *_FIGURES], stages),
+        ("Partitions", ["partition", "workers", "slots", "busy", *HEAD_OF_COUNTS], partitions),
+        ("Stages", ["stage", "partition", *HEAD_OF_COUNTS], stages),
         ("Clients", [HEAD_OF_CLIENTS[0], "partition", *HEAD_OF_CLIENTS[1:]], clients),
         ("Shared queues", HEAD_OF_QUEUES, queues),
         ("Workers", _OF_A_WORKER, rows_of_workers),
@@ -148,10 +146,6 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
 
 def _label(partition: str) -> str:
     return partition or NO_PARTITION
-
-
-def _counts(stats: StageStats) -> list[object]:
-    return [*(getattr(stats, count) for count in COUNTS), format_seconds(stats.seconds)]
 
 
 def _worker_row(worker: Any) -> list[object]:

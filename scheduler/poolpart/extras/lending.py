@@ -417,6 +417,8 @@ def end_lending(worker: Any, name: str) -> None:
 def lending_plugin(name: str) -> bytes:
     """Return a pickled worker plugin that enables lending in a partition until it is removed.
 
+    The plugin also measures the peak memory of the partition's stages (see `peaks.py`).
+
     A plugin is used because a joining worker receives plugins before its first tasks, whereas a
     request could arrive after them. Workers on which poolpart is not installed ignore the plugin.
     """
@@ -424,21 +426,25 @@ def lending_plugin(name: str) -> bytes:
     class LendingPlugin(WorkerPlugin):
         # The class is defined in a function so that it is pickled by value.
         lender: Any = None
+        peaks: Any = None
 
         def setup(self, worker: Any) -> None:
             try:
                 from poolpart.extras.lending import begin_lending
+                from poolpart.extras.peaks import PeakMemory
                 from poolpart.internals.names import NESTED, missing_names
             except ImportError:
                 return
             if not missing_names(NESTED):  # the worker's version of Dask may differ
                 self.lender = begin_lending(worker, name)
+                self.peaks = PeakMemory(worker, name)
 
         def teardown(self, worker: Any) -> None:
             if self.lender is not None:
                 from poolpart.extras.lending import end_lending
                 from poolpart.registration import forget_registrations
 
+                self.peaks.stop()
                 end_lending(worker, name)
                 # The scheduler has removed the registrations of all clients for the partition.
                 forget_registrations(name)
@@ -446,6 +452,7 @@ def lending_plugin(name: str) -> bytes:
         def transition(self, key: Any, start: str, finish: str, **kwargs: Any) -> None:
             if self.lender is not None:
                 self.lender.transition(key, finish)
+                self.peaks.transition(key, start)
 
     plugin: bytes = dumps(LendingPlugin())
     return plugin

@@ -78,6 +78,11 @@ def _partition_families(prefix: str, all_stats: Iterable[PartitionStats]) -> Ite
         "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
         "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots on all workers", labels=_LABELS),
         "busy": GaugeMetricFamily(f"{prefix}_busy_slots", "Slots in use", labels=_LABELS),
+        "peak_memory": GaugeMetricFamily(
+            f"{prefix}_peak_memory_bytes",
+            "Highest memory of a worker process while it was running a task",
+            labels=_LABELS,
+        ),
     }
     tasks = GaugeMetricFamily(f"{prefix}_tasks", "Unfinished tasks", labels=[*_LABELS, "state"])
     ended = CounterMetricFamily(

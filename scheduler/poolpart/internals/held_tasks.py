@@ -19,6 +19,8 @@ def add_holding_rules(
     choose: Callable[[Any], Any],
     is_held: Callable[[Any], bool],
     admit: Callable[[Any], None],
+    restrict: Callable[[Any, Any], Any],
+    record_move: Callable[[Any, Any, Any, Any], Any],
 ) -> None:
     """Let poolpart decide when tasks are assigned to workers.
 
@@ -33,6 +35,11 @@ def add_holding_rules(
         Function that returns whether a task in this state is held.
     admit
         Function that is called with a worker that has joined, resumed, or received resources.
+    restrict
+        Function that returns the valid workers of a task, given those according to Dask.
+    record_move
+        Function that is called with the result and the arguments of `move_task_request`, which asks
+        a worker to give up a task, and that returns the result.
 
     Raises
     ------
@@ -53,6 +60,9 @@ def add_holding_rules(
     rules.call_instead(
         scheduler, "bulk_schedule_unrunnable_after_adding_worker", schedule_other_tasks, "ws"
     )
+    rules.call_after(scheduler, "valid_workers", restrict, "ts")
+    if (stealing := scheduler.extensions.get("stealing")) is not None:
+        rules.call_after(stealing, "move_task_request", record_move, "thief")
 
 
 def _may_run(scheduler: Any, task: Any, worker: Any) -> bool:

@@ -208,9 +208,15 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_TASK}.priority",
             f"{_SCHEDULER_TASK}.who_wants",
             f"{_SCHEDULER_TASK}.annotations",
+            f"{_SCHEDULER}.valid_workers(ts)",
+            f"{_STEALING}.move_task_request(ts, victim, thief)",
+            f"{_STEALING}.in_flight",
         ),
-        "hold tasks back until a slot is free; let clients take turns",
-        ("test_shares.py::test_a_second_client_does_not_wait_for_all_tasks_of_the_first",),
+        "hold tasks back until a slot and enough memory are free; let clients take turns",
+        (
+            "test_shares.py::test_a_second_client_does_not_wait_for_all_tasks_of_the_first",
+            "test_memory.py::test_tasks_that_are_moved_find_their_memory",
+        ),
     ),
     PrivateNames(
         SHUFFLES,

@@ -28,6 +28,11 @@ def has_worker_for(scheduler: Any, name: str, slots: float) -> bool:
     return any(declared >= slots for declared in scheduler.resources.get(name, {}).values())
 
 
+def memory_limit(worker: Any) -> int:
+    """Return the memory limit of a worker in bytes, or 0 if it has none."""
+    return int(worker.memory_limit or 0)
+
+
 def free_threads_of(worker: Any) -> int:
     """Return the number of a worker's threads without a task."""
     return int(worker.nthreads - len(worker.processing) + len(worker.long_running))

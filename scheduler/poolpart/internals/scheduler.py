@@ -217,8 +217,13 @@ def hand_off_tasks(
 
 def accepts_moves(scheduler: Any, task: Any) -> bool:
     """Return whether a task can be moved, and is not being moved already."""
-    stealing = scheduler.extensions.get("stealing")
-    return stealing is not None and task not in stealing.in_flight and not task.actor
+    can_move = scheduler.extensions.get("stealing") is not None
+    return can_move and not task.actor and not is_moving(scheduler, task)
+
+
+def is_moving(scheduler: Any, task: Any) -> bool:
+    """Return whether a worker was asked to give up a task and has not replied."""
+    return task in scheduler.extensions["stealing"].in_flight
 
 
 def move_task(scheduler: Any, task: Any, target: Any) -> None:
