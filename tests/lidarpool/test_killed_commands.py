@@ -1,14 +1,17 @@
-"""Commands that are killed at any change on disk, and continued.
+"""Commands that are killed at any change on disk, and continued or repeated.
 
 The computing is replaced by a few values, so that each row of `USERS` takes little time.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +19,17 @@ import pytest
 from tests.kills import count_changes, is_killed
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
-from lidarpool import twin
+from lidarpool import Cloud, save_cloud, twin
+from lidarpool.comparing.comparison_files import write_comparison
+from lidarpool.comparing.fit import charts, fitting
 from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.report import result_pictures
+from lidarpool.report.result_pictures import publish_pictures
 from lidarpool.work import publishing
 from lidarpool.work.work import FOLDER, Step
-from lidarsim.io.storage import TEMPORARY, WRITING
+from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
 
 # Names of files and folders that are not part of a result.
 UNFINISHED = (FOLDER, TEMPORARY, WRITING)
@@ -47,9 +55,15 @@ class User:
     last
         File or folder without which a result is visibly incomplete, relative to the folder that
         contains all outputs.
+    states
+        What a kill may leave.
+    resumes
+        Whether finished items are stored.
     """
 
     last = ""
+    states = ORDER
+    resumes = False
 
     def prepare(self, folder: Path, patches: pytest.MonkeyPatch) -> None:
         """Write the inputs to a folder, and replace the computing."""
@@ -73,6 +87,7 @@ class _FakeTwin:
 
 class TwinUser(User):
     last = "out/scenario.yaml"
+    resumes = True
 
     def prepare(self, folder, patches):
         drive = write_pcd_drive(folder / "drive", recorded_points(4))
@@ -94,7 +109,87 @@ class TwinUser(User):
         twin(drive, out=out, voxel_m=0.1 * version, resume=resume, overwrite=True)
 
 
-USERS: dict[str, Callable[[], User]] = {"twin": TwinUser}
+class CompareUser(User):
+    last = "out/compare.json"
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        picture = SimpleNamespace(png=lambda: f"picture {version}".encode())
+        names = ["map", "above"][: 3 - version]  # the earlier result has more files
+        table = "table" if version == 1 else None
+        pages = dict.fromkeys(names, picture)
+        write_comparison(outputs / "out", {"version": version}, f"page {version}", pages, table)
+
+
+class FitUser(User):
+    last = "sensor.yaml"
+
+    def prepare(self, folder, patches):
+        patches.setattr(charts, "draw_charts", lambda figures: SimpleNamespace(svg=str))
+        patches.setattr(fitting, "render_template", lambda *_, report, **__: f"page of {report}")
+        patches.setattr(fitting.Fit, "__repr__", lambda self: f"fit {self.figures}")
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        model = SimpleNamespace(model_dump=lambda **_: {"name": str(version)})
+        fitting.Fit(version, model).save(outputs / "sensor.yaml")
+
+
+class PlotUser(User):
+    last = "map.png"
+
+    def prepare(self, folder, patches):
+        def draw(shown, result, folder, *_):
+            (folder / "report.html").write_text(f"page {shown}")
+            paths = [folder / "path.png", folder / "map.png"]
+            for path in paths:
+                path.write_text(f"picture {shown}")
+            return paths
+
+        patches.setattr(result_pictures, "draw_pictures", draw)
+        (folder / "report.html").write_text("page")
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        publish_pictures(version, outputs, outputs, inputs / "report.html")
+
+
+class ExportUser(User):
+    last = "cloud.ply"
+    states = ("earlier", "new")
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        save_cloud(Cloud(np.full((3, 3), float(version)), {}), outputs / "cloud.ply")
+
+
+class FolderUser(User):
+    last = "bag"
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        with (
+            explain_os_errors("The bag cannot be written"),
+            publishing.publishing(outputs / "bag") as staged,
+        ):
+            (staged / "bag" / "topic").mkdir(parents=True)
+            for number in range(3 - version):
+                (staged / "bag" / "topic" / f"{number}").write_text(f"message of {version}")
+
+
+class FileUser(User):
+    last = "picture.png"
+    states = ("earlier", "new")
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        with explain_os_errors("The picture cannot be written"):
+            replace_file(outputs / "picture.png", f"picture {version}".encode())
+
+
+USERS: dict[str, Callable[[], User]] = {
+    "twin": TwinUser,
+    "compare": CompareUser,
+    "fit": FitUser,
+    "plot": PlotUser,
+    "export": ExportUser,
+    "folder": FolderUser,
+    "picture": FileUser,
+}
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -136,8 +231,7 @@ class Kills:
 
     def kill(self, position: int) -> str:
         """Kill the command, and return what is left, after which it is continued."""
-        shutil.rmtree(self.outputs)
-        shutil.copytree(self.before, self.outputs)
+        self._restore()
         killed = is_killed(position, self.outputs.parent, lambda: self.run(2))
         left = self._check()
         # A second kill while the command is continued.
@@ -146,7 +240,30 @@ class Kills:
         self._check()
         self.run(2, resume=True)
         assert files(self.outputs) == self.new
+        assert not [*self.outputs.rglob(".lidarpool-*")]
         return left
+
+    def fill_disk(self) -> None:
+        """Run the command while no file can be flushed to the disk, and then continue it."""
+
+        def fsync(_):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        self._restore()
+        with pytest.MonkeyPatch.context() as patches:
+            patches.setattr(os, "fsync", fsync)
+            with pytest.raises(LidarError, match="No space left") as info:
+                self.run(2)
+        assert not any(name in str(info.value) for name in UNFINISHED)
+        notes = getattr(info.value, "__notes__", [])
+        assert any("`--resume`" in note for note in notes) == self.user.resumes
+        assert self._check() == "earlier"
+        self.run(2, resume=True)
+        assert files(self.outputs) == self.new
+
+    def _restore(self) -> None:
+        shutil.rmtree(self.outputs)
+        shutil.copytree(self.before, self.outputs)
 
     def _check(self) -> str:
         """Check that there is one whole result, or visibly none."""
@@ -169,7 +286,7 @@ class Kills:
 def kills(request, tmp_path, monkeypatch):
     made = Kills(USERS[request.param](), tmp_path)
     made.prepare(monkeypatch)
-    monkeypatch.setattr(publishing, "flush", lambda path: None)  # takes most of the time
+    monkeypatch.setattr(os, "fsync", lambda handle: None)  # takes most of the time
     return made
 
 
@@ -180,8 +297,12 @@ def test_a_killed_command_leaves_one_result_or_visibly_none_and_is_continued(kil
     assert left[0] == "earlier"
 
 
+def test_a_full_disk_leaves_the_earlier_result_and_the_finished_items(kills):
+    kills.fill_disk()
+
+
 @pytest.mark.extended
 def test_wherever_a_command_is_killed(kills):
     left = [kills.kill(position) for position in range(kills.changes + 1)]
     assert left == sorted(left, key=ORDER.index)
-    assert {*left} == {*ORDER}
+    assert {*left} == {*kills.user.states}

@@ -1,153 +1,21 @@
-"""Results that replace earlier ones: killed at each change on disk or in a remote storage."""
+"""Results in remote storage, and files with several writers."""
 
 from __future__ import annotations
 
-import errno
-import os
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
-from types import SimpleNamespace
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from tests.kills import KilledError, is_killed
+from tests.kills import KilledError
 
-from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.clouds.folder import output_destination
-from lidarpool.comparing.comparison_files import write_comparison
-from lidarpool.comparing.fit import charts, fitting
-from lidarpool.report import result_pictures
 from lidarpool.report.result_files import REPORT, obsolete_files
 from lidarpool.work import publishing
 from lidarpool.work.publishing import move_into_place
-from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage, replace_file, replacing_file, staging
-
-
-def compare(folder, version):
-    picture = SimpleNamespace(png=lambda: version.encode())
-    pages = {"map": picture} | ({"above": picture} if version == "earlier" else {})
-    table = version if version == "earlier" else None
-    write_comparison(folder, {"version": version}, version, pages, table)
-
-
-def fit(folder, version):
-    model = SimpleNamespace(model_dump=lambda **_: {"name": version})
-    fitting.Fit({"version": version}, model).save(folder / "sensor.yaml")
-
-
-def export(folder, version):
-    x = {"earlier": 1.0, "new": 2.0}[version]
-    cloud = Cloud(np.full((3, 3), x), {})
-    save_cloud(cloud, folder / "cloud.ply")
-
-
-def draw(folder, version):
-    (folder / "report.html").exists() or (folder / "report.html").write_text("page")
-    shown = SimpleNamespace(version=version)
-    result_pictures.publish_pictures(shown, folder, folder, folder / "report.html")
-
-
-def write(folder, version):
-    with explain_os_errors("The file cannot be written"):
-        replace_file(folder / "file", version.encode())
-
-
-class Publisher(NamedTuple):
-    """A function that writes a result to a folder, and the file that marks it as complete."""
-
-    publish: Callable
-    last: str
-    others: tuple[str, ...] = ()
-
-
-PUBLISHERS = {
-    "compare": Publisher(compare, "compare.json", ("compare.html", "compare-map.png")),
-    "fit": Publisher(fit, "sensor.yaml", ("sensor.html",)),
-    "export": Publisher(export, "cloud.ply"),
-    "plot": Publisher(draw, "map.png", ("path.png", "report.html")),
-    "one file": Publisher(write, "file"),
-}
-
-
-@pytest.fixture
-def _drawings(monkeypatch):
-    """Pictures and pages that state their version."""
-
-    def draw_pictures(shown, result, folder, *_):
-        (folder / "report.html").write_text(f"page {shown.version}")
-        paths = [folder / "path.png", folder / "map.png"]
-        for path in paths:
-            path.write_text(shown.version)
-        return paths
-
-    picture = SimpleNamespace(svg=lambda: "<svg/>")
-    monkeypatch.setattr(result_pictures, "draw_pictures", draw_pictures)
-    monkeypatch.setattr(charts, "draw_charts", lambda figures: picture)
-    monkeypatch.setattr(
-        fitting, "render_template", lambda *_, report, **__: f"page {report['version']}"
-    )
-    monkeypatch.setattr(fitting.Fit, "__repr__", lambda self: self.figures["version"])
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.mark.usefixtures("_drawings")
-@pytest.mark.parametrize("name", PUBLISHERS)
-def test_a_killed_command_leaves_the_earlier_result_the_new_one_or_visibly_none(
-    name, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(os, "fsync", lambda _: None)  # a kill does not lose what was written
-    publisher = PUBLISHERS[name]
-    results = {}
-    for version in ("earlier", "new"):
-        folder = tmp_path / version
-        folder.mkdir()
-        publisher.publish(folder, version)
-        results[version] = contents(folder)
-        assert {*results[version]} >= {publisher.last, *publisher.others}
-    assert {*results["new"]} == {publisher.last, *publisher.others}
-    seen = set()
-    changes = 0
-    killed = True
-    while killed:
-        folder = tmp_path / str(changes)
-        folder.mkdir()
-        (folder / "notes.txt").write_text("of the user")
-        publisher.publish(folder, "earlier")
-        killed = is_killed(changes, folder, lambda: publisher.publish(folder, "new"))  # noqa: B023
-        left = {p.name: p.read_bytes() for p in folder.iterdir() if not p.name.startswith(".")}
-        assert left.pop("notes.txt") == b"of the user"
-        if publisher.last in left:
-            (version,) = [version for version, files in results.items() if files == left]
-            seen.add(version)
-        publisher.publish(folder, "new")  # removes what the killed command has left behind
-        assert contents(folder) == results["new"] | {"notes.txt": b"of the user"}
-        assert {path.name for path in folder.iterdir()} == {*results["new"], "notes.txt"}
-        changes += 1
-    assert seen == {"earlier", "new"} and changes > 2
-
-
-@pytest.mark.usefixtures("_drawings")
-@pytest.mark.parametrize("name", PUBLISHERS)
-def test_a_full_disk_leaves_the_earlier_result(name, tmp_path, monkeypatch):
-    publisher = PUBLISHERS[name]
-    publisher.publish(tmp_path, "earlier")
-    earlier = contents(tmp_path)
-
-    def fsync(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    with pytest.raises(LidarError, match="No space left") as info:
-        publisher.publish(tmp_path, "new")
-    assert ".lidarpool" not in str(info.value)
-    assert contents(tmp_path) == earlier
 
 
 class RemoteKills:
@@ -179,54 +47,75 @@ class RemoteKills:
         return False
 
 
-RUNS = {
-    "earlier": ["cloud.ply", "path.png", "pcd/0.pcd", "pcd/1.pcd", "report.html", REPORT],
-    "new": ["cloud.ply", "pcd/0.pcd", "report.html", REPORT],
-}
-OBSOLETE = obsolete_files(["cloud.ply", "pcd", "report.html", REPORT], ["cloud.ply", "path.png"])
+class Result(NamedTuple):
+    """Files of an earlier and of a new result, and what marks a complete one."""
+
+    files: dict[str, list[str]]
+    last: str
+    mark: str
+    obsolete: Sequence[str] = ()
 
 
-def publish_run(folder, storage, version):
-    """Stage the files of a run in a local folder, and publish them."""
+RUN = Result(
+    {
+        "earlier": ["cloud.ply", "path.png", "pcd/0.pcd", "pcd/1.pcd", "report.html", REPORT],
+        "new": ["cloud.ply", "pcd/0.pcd", "report.html", REPORT],
+    },
+    REPORT,
+    REPORT,
+    obsolete_files(["cloud.ply", "pcd", "report.html", REPORT], ["cloud.ply", "path.png"]),
+)
+BAG = Result({"earlier": ["bag/0", "bag/1", "bag/2"], "new": ["bag/0", "bag/2"]}, "bag", "bag/0")
+PLOT = Result(
+    {"earlier": ["map.png", "path.png"], "new": ["map.png", "path.png"]}, *["map.png"] * 2
+)
+
+
+def publish(result, folder, storage, version):
+    """Stage the files of a result in a local folder, and publish them."""
     with staging(folder) as staged:
-        for name in RUNS[version]:
+        for name in result.files[version]:
             (staged / name).parent.mkdir(exist_ok=True)
             (staged / name).write_text(version)
-        move_into_place(staged, storage, last=REPORT, remove=OBSOLETE)
+        move_into_place(staged, storage, last=result.last, remove=result.obsolete)
 
 
 def remote_contents(storage):
     return {name: storage.read(name).decode() for name in storage.tree()}
 
 
-def test_a_run_that_is_killed_while_its_result_goes_to_a_remote_storage(tmp_path, monkeypatch):
+@pytest.mark.parametrize("result", [RUN, BAG, PLOT], ids=["run", "bag", "plot"])
+def test_a_kill_while_a_result_goes_to_a_remote_storage(result, tmp_path, monkeypatch):
     kills = RemoteKills(monkeypatch)
-    results = {version: dict.fromkeys(names, version) for version, names in RUNS.items()}
-    seen = set()
+    results = {version: dict.fromkeys(names, version) for version, names in result.files.items()}
+    seen = []
     changes = 0
     killed = True
     while killed:
         storage = output_destination(f"memory://{tmp_path.name}-{changes}/out")
         storage.write("notes.txt", b"of the user")
-        publish_run(tmp_path, storage, "earlier")
-        killed = kills.is_killed(changes, partial(publish_run, tmp_path, storage, "new"))
+        publish(result, tmp_path, storage, "earlier")
+        killed = kills.is_killed(changes, partial(publish, result, tmp_path, storage, "new"))
         left = remote_contents(storage)
         assert left.pop("notes.txt") == "of the user"
         left = {name: text for name, text in left.items() if not name.startswith(".")}
-        if REPORT in left:
+        if result.mark in left:
             (version,) = [version for version, files in results.items() if files == left]
-            seen.add(version)
+            seen.append(version)
+        else:
+            seen.append("incomplete")
         if left.get("report.html") == "new":
             assert {*left.values()} == {"new"}
-        publish_run(tmp_path, storage, "new")
+        publish(result, tmp_path, storage, "new")
         assert remote_contents(storage) == results["new"] | {"notes.txt": "of the user"}
         changes += 1
-    assert seen == {"earlier", "new"} and changes > 10
+    assert seen == sorted(seen, key=["earlier", "incomplete", "new"].index)
+    assert len({*seen}) == 3
 
 
 def test_an_upload_that_fails_leaves_the_earlier_result(tmp_path, monkeypatch):
     storage = output_destination(f"memory://{tmp_path.name}/out")
-    publish_run(tmp_path, storage, "earlier")
+    publish(RUN, tmp_path, storage, "earlier")
     earlier = remote_contents(storage)
 
     def put_file(*_, **__):
@@ -235,7 +124,7 @@ def test_an_upload_that_fails_leaves_the_earlier_result(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(MemoryFileSystem, "put_file", put_file)
         with pytest.raises(OSError, match="quota"):
-            publish_run(tmp_path, storage, "new")
+            publish(RUN, tmp_path, storage, "new")
     assert remote_contents(storage) == earlier
 
 
@@ -245,8 +134,8 @@ def test_a_storage_that_cannot_copy_gets_the_files_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(MemoryFileSystem, "cp_file", cp_file)
     storage = output_destination(f"memory://{tmp_path.name}/out")
-    publish_run(tmp_path, storage, "new")
-    assert remote_contents(storage) == dict.fromkeys(RUNS["new"], "new")
+    publish(RUN, tmp_path, storage, "new")
+    assert remote_contents(storage) == dict.fromkeys(RUN.files["new"], "new")
 
 
 def test_writers_of_the_same_file_do_not_remove_the_files_of_each_other(tmp_path):

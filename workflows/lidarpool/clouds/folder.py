@@ -5,16 +5,13 @@ A folder has one writer at a time, and never contains partial files.
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from lidarsim.errors import LidarError, MissingFileError, as_sentence, explain_os_errors
-from lidarsim.io.storage import Storage, is_url
+from lidarsim.io.storage import Storage, is_url, lock
 
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 
@@ -75,24 +72,24 @@ def result_folder(output: Path | Storage, shown: Path | None = None) -> Iterator
     ]  # innermost first
     kind = "folder" if shown is None else "path"
     place = f"the folder {folder}" if shown is None else str(shown)
-    with explain_os_errors(f"Cannot write to {place}", f"specify another {kind} with `--out`"):
+    with ExitStack() as stack:
+        with explain_os_errors(f"Cannot write to {place}", f"specify another {kind} with `--out`"):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryFile(dir=folder):
+                    stack.enter_context(lock(folder, wait=False))
+                Storage.at(folder).remove_unfinished(deep=False)
+            except BlockingIOError as error:
+                raise LidarError(
+                    f"Another run or export is using {place}. Wait until it has finished, or "
+                    f"specify another {kind} with `--out`."
+                ) from error
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                lock = _lock(folder)
-            Storage.at(folder).remove_unfinished(deep=False)
-        except BlockingIOError as error:
-            raise LidarError(
-                f"Another run or export is using {place}. Wait until it has finished, or specify "
-                f"another {kind} with `--out`."
-            ) from error
-    try:
-        yield folder
-    finally:
-        for path in missing_folders:
-            if path.exists() and not any(path.iterdir()):
-                path.rmdir()
-        os.close(lock)
+            yield folder
+        finally:
+            for path in missing_folders:
+                if path.exists() and not any(path.iterdir()):
+                    path.rmdir()
 
 
 def check_exists(place: Path | Storage, advice: str) -> None:
@@ -153,15 +150,3 @@ def local_folder(output: Path | Storage) -> Iterator[Path]:
         folder = Path(temporary, output.url.rpartition("/")[2])
         folder.mkdir()
         yield folder
-
-
-def _lock(folder: Path) -> int:
-    """Lock a folder until the returned file descriptor is closed or this process exits."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
-            os.close(handle)
-            raise
-    return handle

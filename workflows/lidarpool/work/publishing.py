@@ -45,7 +45,8 @@ def move_into_place(
     Parameters
     ----------
     staged
-        Folder with the files. If the target is a folder, it is in the same file system.
+        Folder with the files, which the caller removes afterward. If the target is a folder, it is
+        in the same file system.
     target
         Folder or storage of the result, which the caller has locked. Files and folders with the
         same names are replaced.
@@ -62,24 +63,41 @@ def move_into_place(
         (path.name for path in staged.iterdir() if path.name != last),
         key=lambda name: (name.endswith(".html"), name),
     )
-    entries = storage.entries()
+    existing = storage.entries()
     # A file is replaced in one operation, in contrast to a folder.
     folders = [
-        name for name in (last, *names) if (staged / name).is_dir() or entries.get(name, 0) is None
+        name for name in (last, *names) if (staged / name).is_dir() or existing.get(name, 0) is None
     ]
-    obsolete = [*remove, *folders]
+    obsolete = dict.fromkeys(name for name in (*remove, *folders) if name != last)
+
+    def discard(name: str) -> None:
+        if existing.get(name, 0) is None:
+            _discard_folder(storage, name, staged)
+        else:
+            storage.discard(name)
+
     with _prepared(staged, storage, last) as move, defer_interrupts():
-        if names or obsolete:
-            storage.discard(last)
+        if names or obsolete or last in folders:
+            discard(last)
             _flush(storage)  # a crash must not leave an earlier `last` beside other changes
         for name in obsolete:
-            storage.discard(name)
+            discard(name)
         for name in names:
             move(name)
         _flush(storage)
         move(last)
         _flush(storage)  # makes the moves durable before anything else is removed
         on_written()
+
+
+def _discard_folder(storage: Storage, name: str, staged: Path) -> None:
+    """Remove a folder, so that no part of it remains that looks complete after a kill."""
+    if storage.is_local:
+        # The caller removes the staging folder.
+        (storage.local() / name).rename(staged / f"{WRITING}{secrets.token_hex(4)}")
+    else:
+        storage.remove(sorted(storage.tree(name))[:1])
+        storage.discard(name)
 
 
 @contextmanager

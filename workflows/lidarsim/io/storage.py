@@ -460,7 +460,11 @@ class Storage:
             return
         for folder, folders, files in os.walk(self.local()):
             for path in (Path(folder, name) for name in (*folders, *files)):
-                if _is_leftover(final, path.name) and not path.is_symlink() and not is_locked(path):
+                if (
+                    _is_leftover(final, path.name)
+                    and not path.is_symlink()
+                    and not _is_locked(path)
+                ):
                     self.discard(path.relative_to(self.url).as_posix())
             if not deep:
                 break
@@ -472,39 +476,42 @@ def _is_leftover(final: str | None, name: str) -> bool:
 
 
 @contextmanager
-def lock(path: Path) -> Iterator[None]:
-    """Lock an unfinished file or folder, so that other processes do not remove it."""
+def lock(path: Path, *, wait: bool = True) -> Iterator[None]:
+    """Lock a file or folder until the context exits or this process ends.
+
+    Network disks without locks are supported, but any number of processes can lock their files.
+
+    Raises
+    ------
+    BlockingIOError
+        If `wait` is false and another context has locked the file or folder.
+    """
     handle = os.open(path, os.O_RDONLY)
     try:
-        with suppress(OSError):  # a network disk without locks
-            _flock(handle, wait=True)
+        _flock(handle, wait=wait)
         yield
     finally:
         os.close(handle)
 
 
-def is_locked(path: Path) -> bool:
-    """Return whether `lock` is in use for a file or folder in any process."""
+def _is_locked(path: Path) -> bool:
     try:
-        handle = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        _flock(handle, wait=False)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    finally:
-        os.close(handle)
-    return False
+        with lock(path, wait=False):
+            return False
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
 
 
 def _flock(handle: int, *, wait: bool) -> None:
-    if sys.platform != "win32":
-        import fcntl
+    if sys.platform == "win32":
+        return
+    import fcntl
 
+    try:
         fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
+            raise
 
 
 @contextmanager
