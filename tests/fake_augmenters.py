@@ -3,7 +3,9 @@
 import numpy as np
 
 from lidarpool.augmentation.augmented_sweep import AugmentedSweep
+from lidarpool.augmentation.rewriting.rewriter import EncodedSweeps
 from lidarpool.clouds.boxes import SweepBoxes
+from lidarpool.work.publishing import publishing
 
 INTENSITY = 0.25  # of each added point
 NAMES = ("Inserted car 1", "walker 2")
@@ -68,13 +70,27 @@ def two_boxes(first_object=50, points=(12, 0)):
     )
 
 
+def write_sweep(rewriter, work, number, augmented):
+    """Write the encoded files of a sweep to a folder."""
+    for name, content in rewriter.sweep_files(number, augmented).items():
+        path = EncodedSweeps(work, 0).path(number, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def finish(rewriter, target, work, others=(), *, overwrite=False):
+    """Write the augmented copy of a recording, and return the notes of the rewriter."""
+    rewriter.check_target(target, overwrite=overwrite)
+    with publishing(target) as staged:
+        return rewriter.finish(staged / target.name, work, others)
+
+
 def rewrite(rewriter, target, work, augment, numbers=None, **options):
     """Encode all sweeps of a recording in any order, and return the notes of the rewriter."""
     count = len(rewriter.recording)
     for number in reversed(range(count)) if numbers is None else numbers:
-        rewriter.write_sweep(work, number, augment(rewriter.recording, number))
-        assert rewriter.is_written(work, number)
-    return rewriter.finish(target, work, **options)
+        write_sweep(rewriter, work, number, augment(rewriter.recording, number))
+    return finish(rewriter, target, work, **options)
 
 
 def content(folder):

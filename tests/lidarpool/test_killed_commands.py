@@ -9,7 +9,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -20,6 +20,10 @@ from tests.kills import count_changes, is_killed
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
 from lidarpool import Cloud, save_cloud, twin
+from lidarpool.augmentation.effects import Effects
+from lidarpool.augmentation.running import Augmentation
+from lidarpool.augmentation.sweep_tasks import PartProcess, RecordingFile
+from lidarpool.augmentation.variants import CampaignVariants, Variants
 from lidarpool.comparing.comparison_files import write_comparison
 from lidarpool.comparing.fit import charts, fitting
 from lidarpool.reconstruction import building
@@ -109,6 +113,62 @@ class TwinUser(User):
         twin(drive, out=out, voxel_m=0.1 * version, resume=resume, overwrite=True)
 
 
+class AugmentUser(User):
+    """Augmentation of a folder, which is replaced as a whole."""
+
+    last = "out"
+    resumes = True
+
+    def prepare(self, folder, patches):
+        write_pcd_drive(folder / "drive", recorded_points(2))
+        stored = {}
+        compute = PartProcess.files
+
+        def load(part, number, variant):
+            key = part.file.path.name, part.plan.variants[variant].seed, number
+            if key not in stored:
+                stored[key] = compute(part, number, variant)
+            return stored[key]
+
+        patches.setattr(PartProcess, "files", load)
+        patches.setattr(PartProcess, "prepare", lambda part, variant: None)
+
+    def augmentation(self, inputs, version):
+        effects = replace(Effects.load(options={"weather": {"rain_mm_h": 50}}), seed=version)
+        return Augmentation(RecordingFile(inputs / "drive"), Variants(effects))
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        augmentation = self.augmentation(inputs, version)
+        augmentation.run(outputs / "out", workers=1, resume=resume, overwrite=True)
+
+
+class AugmentFileUser(AugmentUser):
+    """Augmentation of a file."""
+
+    last = "out/000001.pcd"
+    states = ("earlier", "new")
+
+    def augmentation(self, inputs, version):
+        augmentation = super().augmentation(inputs, version)
+        return replace(augmentation, file=RecordingFile(inputs / "drive" / "000001.pcd"))
+
+
+class AugmentCampaignUser(AugmentUser):
+    """Augmentation with several variants, of which the second version has fewer."""
+
+    last = "out/variants.csv"
+
+    def prepare(self, folder, patches):
+        super().prepare(folder, patches)
+        (folder / "effects.yaml").write_text("weather: {visibility_km: 1}\n")
+        (folder / "campaign.yaml").write_text("base: effects.yaml\ncount: 3\n")
+
+    def augmentation(self, inputs, version):
+        variants = CampaignVariants(inputs / "campaign.yaml")
+        variants.count = 4 - version
+        return replace(super().augmentation(inputs, version), variants=variants)
+
+
 class CompareUser(User):
     last = "out/compare.json"
 
@@ -183,6 +243,9 @@ class FileUser(User):
 
 USERS: dict[str, Callable[[], User]] = {
     "twin": TwinUser,
+    "augment": AugmentUser,
+    "augment, file": AugmentFileUser,
+    "augment, campaign": AugmentCampaignUser,
     "compare": CompareUser,
     "fit": FitUser,
     "plot": PlotUser,
@@ -240,7 +303,7 @@ class Kills:
         self._check()
         self.run(2, resume=True)
         assert files(self.outputs) == self.new
-        assert not [*self.outputs.rglob(".lidarpool-*")]
+        assert not [path for path in self.outputs.rglob("*") if path.name.startswith(UNFINISHED)]
         return left
 
     def fill_disk(self) -> None:

@@ -205,7 +205,7 @@ def test_resampling_requires_no_effects(captured):
             "`--sweeps` and `--sensor` cannot be combined",
         ),
         (["--rain", 1, "--partial"], "`--partial` requires `--sensor`."),
-        (["--rain", 1, "--resume", "--overwrite"], "`--resume` and `--overwrite` cannot be"),
+        (["--rain", 1, "--resume", "--restart"], "`--resume` and `--restart` cannot be"),
         (["--rain", -1], "-1.0 is not in the range"),
         (["--rain", 1, "--model", "velodyne/none"], "velodyne/none"),
         (["--rain", 1, "--sensor", "velodyne/none"], "velodyne/none"),

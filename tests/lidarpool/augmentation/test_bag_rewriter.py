@@ -14,7 +14,15 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
+from tests.fake_augmenters import (
+    changed,
+    content,
+    finish,
+    identity,
+    rewrite,
+    two_boxes,
+    write_sweep,
+)
 
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.opening import open_rewriter
@@ -241,12 +249,12 @@ def test_order_of_sweeps_and_several_readers(written, tmp_path):
     path = written("mcap")
     first, second = opened(path), opened(path)
     for number in (2, 0, 1):
-        first.write_sweep(tmp_path / "a", number, changed(first.recording, number))
+        write_sweep(first, tmp_path / "a", number, changed(first.recording, number))
     for number in range(3):
-        second.write_sweep(tmp_path / "b", number, changed(second.recording, number))
+        write_sweep(second, tmp_path / "b", number, changed(second.recording, number))
     assert content(tmp_path / "a") == content(tmp_path / "b")
-    first.finish(tmp_path / "a.mcap", tmp_path / "a")
-    second.finish(tmp_path / "b.mcap", tmp_path / "b")
+    finish(first, tmp_path / "a.mcap", tmp_path / "a")
+    finish(second, tmp_path / "b.mcap", tmp_path / "b")
     found = [messages(tmp_path / f"{name}.mcap") for name in "ab"]
     assert found[0] == found[1]
     assert not [*tmp_path.glob(".lidarpool*")]
@@ -260,10 +268,11 @@ def test_several_topics(written, tmp_path, name):
     works = [tmp_path / "w0", tmp_path / "w1"]
     for rewriter, work in zip(rewriters, works, strict=True):
         for number in range(3):
-            rewriter.write_sweep(work, number, changed(rewriter.recording, number, two_boxes()))
+            write_sweep(rewriter, work, number, changed(rewriter.recording, number, two_boxes()))
     new = tmp_path / path.name
-    notes = rewriters[0].finish(new, works[0], others=[(rewriters[1], works[1])])
+    notes = finish(rewriters[0], new, works[0], others=[(rewriters[1], works[1])])
     assert [note for note in notes if "Only the sweeps" in note] == []
+    assert {file.name for file in tmp_path.iterdir()} == {"w0", "w1", new.name}
     for topic, rewriter in zip(topics, rewriters, strict=True):
         recording = open_recording(new, topic, keep_noise=True)
         for number in range(3):
@@ -475,6 +484,6 @@ def test_damaged_chunks(written, tmp_path):
     position = data.index(rewriter._messages().read(2)[2][-40:])
     path.write_bytes(data[:position] + b"damaged!" + data[position + 8 :])
     with pytest.raises(LidarError, match=r"source\.mcap"):
-        rewriter.finish(tmp_path / "other.mcap", tmp_path / "work")
+        finish(rewriter, tmp_path / "other.mcap", tmp_path / "work")
     assert not (tmp_path / "other.mcap").exists()
     assert not [*tmp_path.glob(".lidarpool*")]

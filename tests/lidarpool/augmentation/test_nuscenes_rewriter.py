@@ -9,7 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.drives import points_of, the_scene, the_sweeps, write_set
-from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
+from tests.fake_augmenters import (
+    changed,
+    content,
+    finish,
+    identity,
+    rewrite,
+    two_boxes,
+    write_sweep,
+)
 
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.nuscenes_categories import visibility_token
@@ -281,9 +289,9 @@ def test_several_channels(drive, tmp_path):
     works = [tmp_path / "w0", tmp_path / "w1"]
     for rewriter, work in zip(rewriters, works, strict=True):
         for number in range(3):
-            rewriter.write_sweep(work, number, with_objects(rewriter.recording, number))
+            write_sweep(rewriter, work, number, with_objects(rewriter.recording, number))
     new = tmp_path / "new"
-    rewriters[0].finish(new, works[0], others=[(rewriters[1], works[1])])
+    finish(rewriters[0], new, works[0], others=[(rewriters[1], works[1])])
     tables = tables_of(new)
     assert len(tables["instance"]) == len(tables_of(drive)["instance"]) + 4
     assert [row["name"] for row in tables["category"].values()].count("walker") == 1

@@ -17,10 +17,11 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 import poolpart.deploy
 from lidarpool import LidarError, box, load_sensor, open_recording
 from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.augmentation.running import Augmentation
+from lidarpool.augmentation.running import WORK_SUFFIX, Augmentation
 from lidarpool.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
 from lidarpool.augmentation.variants import CampaignVariants, Variants
-from lidarpool.augmentation.work_folder import WorkFolder
+from lidarpool.work.work import FOLDER, Work
+from lidarsim.io.storage import Storage
 
 SWEEPS = 8
 RAIN = {"weather": {"rain_mm_h": 50, "visibility_km": 0.2}}
@@ -72,6 +73,11 @@ def content(folder):
     """Return the contents of all files in a folder."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def work_folder(out):
+    """Return the folder with the encoded sweeps of an output."""
+    return out.with_name(f"{out.name}{WORK_SUFFIX}")
 
 
 def stop_after(count):
@@ -128,7 +134,7 @@ def test_an_interrupted_run_continues_with_the_same_bytes(augmentation, tmp_path
     assert steps[0] == (5, SWEEPS)
     assert content(out) == content(tmp_path / "expected")
     assert resumed.sweeps == SWEEPS
-    assert not WorkFolder.for_output(out).exists()
+    assert not work_folder(out).exists()
 
 
 @pytest.mark.extended
@@ -159,7 +165,7 @@ def test_a_partly_written_output_is_written_again(augmentation, tmp_path, monkey
     def stop(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(WorkFolder, "end_output", stop)
+    monkeypatch.setattr(Work, "forget", stop)
     with pytest.raises(KeyboardInterrupt):  # after the output was moved into place
         augmentation.run(out, workers=1)
     monkeypatch.undo()
@@ -178,7 +184,7 @@ def test_nothing_is_left_if_nothing_was_augmented(augmentation, drive, tmp_path)
 @pytest.mark.extended
 def test_workers_without_the_work_folder_return_files(augmentation, tmp_path, monkeypatch):
     augmentation.run(tmp_path / "expected", workers=1)
-    monkeypatch.setattr(WorkFolder, "is_accessible", lambda self: False)
+    monkeypatch.setattr(Storage, "has_content", lambda *arguments: False)
     augmentation.run(tmp_path / "wet", workers=1)
     assert content(tmp_path / "wet") == content(tmp_path / "expected")
 
@@ -203,7 +209,8 @@ def test_a_cluster_augments_sweeps(augmentation, tmp_path):
             lambda a: replace(a, variants=Variants(replace(Effects.load(options=RAIN), seed=1))),
             "effects",
         ),
-        (lambda a: replace(a, model=load_sensor("velodyne/vlp16")), "options"),
+        (lambda a: replace(a, model=load_sensor("velodyne/vlp16")), "model"),
+        (lambda a: replace(a, resampled=load_sensor("velodyne/vlp16")), "sensor"),
         (lambda a: replace(a, numbers=range(3)), "options"),
         (lambda a: replace(a, file=replace(a.file, intensity="ring")), "options"),
         (None, "recording"),
@@ -219,15 +226,15 @@ def test_changed_inputs_are_refused(augmentation, drive, tmp_path, change, noun)
         augmentation = change(augmentation)
     with pytest.raises(LidarError, match=rf"different inputs \({noun}\)"):
         augmentation.run(out, workers=1, resume=True)
-    assert len([*WorkFolder.for_output(out).glob("*/*/.counts/*.json")]) == 2
+    assert len([*work_folder(out).rglob("encode/*/*/*/item.json")]) == 2
 
 
 def test_other_software_is_refused(augmentation, tmp_path, monkeypatch):
     out = tmp_path / "wet"
     with pytest.raises(KeyboardInterrupt):
         augmentation.run(out, workers=1, progress=stop_after(2))
-    other = "lidarpool.augmentation.running.software"
-    monkeypatch.setattr(other, lambda: {"lidarpool": "0.0 (sources 1)"})
+    other = {"lidarpool": "0.0 (sources 1)"}
+    monkeypatch.setattr("lidarpool.work.work.software", lambda: other)
     with pytest.raises(LidarError, match=r"different inputs \(version of lidarpool\)"):
         augmentation.run(out, workers=1, resume=True)
 
@@ -237,10 +244,10 @@ def test_damaged_manifests_are_reported(augmentation, tmp_path):
     out = tmp_path / "wet"
     with pytest.raises(KeyboardInterrupt):
         augmentation.run(out, workers=1, progress=stop_after(2))
-    (WorkFolder.for_output(out) / "manifest.json").write_text("{")
-    with pytest.raises(LidarError, match=r"is damaged\. Start again with `--overwrite`"):
+    (work_folder(out) / FOLDER / "manifest.json").write_text("{")
+    with pytest.raises(LidarError, match=r"is damaged\. Remove .* with `--restart`"):
         augmentation.run(out, workers=1, resume=True)
-    augmentation.run(out, workers=1, overwrite=True)
+    augmentation.run(out, workers=1, restart=True)
     assert out.exists()
 
 
@@ -249,7 +256,7 @@ def test_a_recording_that_changes_is_noticed(augmentation, drive, tmp_path):
         if done == total:
             os.utime(drive / "000003.pcd", (1, 1))
 
-    with pytest.raises(LidarError, match="was changed while it was augmented"):
+    with pytest.raises(LidarError, match="drive has changed since the augmentation"):
         augmentation.run(tmp_path / "wet", workers=1, progress=change)
     assert not (tmp_path / "wet").exists()
 
@@ -278,11 +285,10 @@ def test_recordings_are_not_overwritten(augmentation, drive, name):
 
 
 def test_folders_with_other_files_are_kept(augmentation, tmp_path):
-    folder = WorkFolder.for_output(tmp_path / "wet")
+    folder = work_folder(tmp_path / "wet")
     folder.mkdir()
     (folder / "notes.txt").write_text("mine")
-    with pytest.raises(LidarError, match="contains other files"):
-        augmentation.run(tmp_path / "wet", workers=1, overwrite=True)
+    augmentation.run(tmp_path / "wet", workers=1, overwrite=True)
     assert content(folder) == {"notes.txt": b"mine"}
 
 

@@ -28,7 +28,7 @@ from ..clouds.recording import Recording, RecordingSource
 from ..clouds.writing import ExportSpec
 from ..columns.parts import StoredCloud, pack
 from .augmented_sweep import AugmentedSweep
-from .rewriting.rewriter import EncodedSweeps, Rewriter, box_details
+from .rewriting.rewriter import EncodedSweeps, Rewriter, box_details, sweep_folder
 from .rewriting.stored_records import convert_values
 
 _PRECISION_M = 0.001  # of positions in world coordinates
@@ -261,7 +261,9 @@ class FormatConverter(Rewriter):
         ]
         cloud = StoredCloud(
             storage=Storage(str(encoded.folder)),
-            names=[_part_file(number) for number in range(encoded.count)],
+            names=[
+                f"{sweep_folder(number)}/{_part_file(number)}" for number in range(encoded.count)
+            ],
             firsts=[*range(encoded.count)],
             rows=summary.rows,
             columns=columns_in_parts(optional),

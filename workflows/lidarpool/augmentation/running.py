@@ -1,15 +1,18 @@
 """Augment all sweeps of a recording in worker processes, and write the augmented copy.
 
-Sweeps are encoded independently of each other and collected in a work folder. A run that was
-stopped at any time continues with the missing sweeps, and its output has the same bytes.
+Sweeps are encoded independently of each other, and stored in a folder next to the output until it
+is complete. An interrupted run continues with the missing sweeps, and its output has the same
+bytes.
 """
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,38 +25,37 @@ from lidarsim.words import join_names, plural
 from ..clouds.folder import result_folder
 from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.writing import ExportSpec
-from ..identity.fingerprint import fingerprint
-from ..identity.versions import software
 from ..work.mapping import MapFunction, parallel_map
-from ..work.work import fingerprint_files
-from .rewriting.data_set_copy import check_target
+from ..work.work import ONCE, FileStep, Inputs, Work
+from .rewriting.data_set_copy import MARK_FILE, check_target
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
     CHECKED_SENSORS,
     MAX_VARIANTS,
+    SUMMARY_FILE,
     AugmentationPlan,
-    EncodedFiles,
-    PartProcess,
     PlannedSweep,
     PlanProcess,
     PointCounts,
     RecordingFile,
-    SharedPlan,
-    SweepTask,
-    augment_sweeps,
-    close_plans,
-    open_plan,
+    SweepEncoder,
+    close_recordings,
+    encoded_folder,
 )
-from .variants import TABLE_FILE, Variants, variants_table
-from .work_folder import WorkFolder
+from .variants import TABLE_FILE, Variants, outputs_in_table, variants_table
 
 if TYPE_CHECKING:
     from distributed import Client
 
 _WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
 _WORKER_SWEEPS = 32  # starting a process takes about as long as augmenting this many sweeps
-_TASK_SWEEPS = 8  # maximum number of sweeps in a task
+_TASK_SWEEPS = 8  # maximum number of consecutive sweeps that a process receives together
 _MIN_TASKS = 64  # so that all workers are busy until the end, if there are enough sweeps
+WORK_SUFFIX = ".augment"  # end of the name of the folder with the encoded sweeps
+_ENCODE = FileStep("encode")
+_BEGIN = FileStep("begin")  # an item for each copy that is being written
+_FINISH = FileStep("finish")  # a summary of each copy that is complete
+_REMOVE = FileStep("remove")  # copies of an earlier campaign that are not replaced
 
 ShowProgress = Callable[[int, int], None]  # called with the numbers of finished and of all sweeps
 
@@ -159,6 +161,7 @@ class Augmentation:
         client: Client | None = None,
         workers: int | None = None,
         resume: bool = False,
+        restart: bool = False,
         overwrite: bool = False,
         progress: ShowProgress = lambda done, total: None,
     ) -> AugmentedRecording:
@@ -176,9 +179,11 @@ class Augmentation:
             Number of processes on this machine. By default, it depends on the number of cores and
             the memory. The output does not depend on it.
         resume
-            Whether to continue with the sweeps of an earlier run that was stopped.
+            Whether to continue an unfinished augmentation.
+        restart
+            Whether to remove an unfinished augmentation.
         overwrite
-            Whether to discard an unfinished run, and to replace existing copies.
+            Whether to replace existing copies.
         progress
             Function that is called with the numbers of finished and of all sweeps.
 
@@ -186,8 +191,10 @@ class Augmentation:
         ------
         LidarError
             If the recording cannot be read or augmented, if the output exists or cannot be
-            written, or if the unfinished run has other inputs.
+            written, or if the unfinished augmentation has different inputs.
         """
+        if resume and restart:
+            raise LidarError("`resume` and `restart` cannot be combined.")
         out = Path(out)
         try:
             files = self.file.each_sensor()
@@ -198,19 +205,26 @@ class Augmentation:
             with ExitStack() as stack:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
-                stack.enter_context(result_folder(WorkFolder.for_output(out), shown=out))
-                if not overwrite and not WorkFolder.is_unfinished(out):
+                folder = out.with_name(f"{out.name}{WORK_SUFFIX}")
+                stack.enter_context(result_folder(folder, shown=out))
+                stack.callback(_remove_empty, folder)
+                if not overwrite and not Work.is_unfinished(folder):
                     for target in targets:  # before the recording is hashed
                         check_target(target, self.file.path, overwrite=False)
-                identity = self._identity()
-                work = WorkFolder.create_or_resume(
-                    out, identity, resume=resume, overwrite=overwrite
+                work = stack.enter_context(
+                    Work.open(
+                        folder,
+                        self._inputs(),
+                        noun="augmentation",
+                        resume=resume,
+                        restart=restart,
+                        overwrite=overwrite,
+                    )
                 )
                 run = _Run(self, files, output, work, targets, progress)
-                with _KeptFolder(work):
-                    return run.augment(out, client, workers)
+                return run.augment(out, client, workers)
         finally:
-            close_plans()
+            close_recordings()
 
     def _output(self) -> ExportSpec | None:
         """Return the output format, or None if it is the format of the recording."""
@@ -252,34 +266,34 @@ class Augmentation:
         remedy = f"Use `--format {name}`, or an output folder." if name else "Use an output folder."
         raise LidarError(f"{out} ends in {ending}, but the copy is a {kind}. {remedy}")
 
-    def _identity(self) -> dict[str, str]:
-        """Return hashes of the inputs, keyed by a noun for messages."""
-        return {
-            "recording": fingerprint_files(self.file.path),
+    def _inputs(self) -> Inputs:
+        numbers = self.numbers
+        options = (
+            str(self.file.folder / self.file.path),
+            self.file.sensor,
+            self.file.intensity,
+            None if numbers is None else [numbers.start, numbers.stop],
+            self.output_format,
+            self.reflectance,
+            self.partial,
+        )
+        values = {
             "effects": self.variants.identity,
-            "options": fingerprint(
-                str(self.file.folder / self.file.path),
-                self.file.sensor,
-                self.file.intensity,
-                self.model,
-                None if self.numbers is None else [self.numbers.start, self.numbers.stop],
-                self.output_format,
-                self.resampled,
-                self.reflectance,
-                self.partial,
-            ),
-            "version of lidarpool": software()["lidarpool"],
+            "model": self.model,
+            "sensor": self.resampled,
+            "options": options,
         }
+        return Inputs({"recording": self.file.path}, values)
 
 
 @dataclass(eq=False)
 class _Run:
-    """Run of an augmentation, whose sweeps are collected in a work folder."""
+    """Run of an augmentation, which stores encoded sweeps until its copies are complete."""
 
     augmentation: Augmentation
     files: tuple[RecordingFile, ...]  # the recording, once for each sensor
     output: ExportSpec | None
-    work: WorkFolder
+    work: Work
     targets: tuple[Path, ...]
     progress: ShowProgress
     _notes: dict[str, None] = field(default_factory=dict)  # in the order of their discovery
@@ -290,14 +304,16 @@ class _Run:
     def augment(self, out: Path, client: Client | None, workers: int | None) -> AugmentedRecording:
         """Augment the missing sweeps, and write the copies that are not complete."""
         groups = self._groups()
-        plan = open_plan(self._shared_plan(groups[0]))
-        self._counts = tuple(len(part.recording) for part in plan.all_parts())
-        self._check(plan)
+        encoder = self._encoder(groups[0])
+        self._counts = tuple(len(part.recording) for part in encoder.process.all_parts())
+        self._check(encoder.process)
         useful_workers = max(self._total // (_WORKER_SWEEPS if workers is None else 1), 1)
         with parallel_map(client, useful_workers, _WORKER_BYTES, workers) as run:
             for group in groups:
-                self._augment_group(group, run)
-        return self._summary(out)
+                if group.start:
+                    encoder = self._encoder(group)
+                self._augment_group(group, encoder, run)
+        return self._end(out)
 
     @property
     def _count(self) -> int:
@@ -330,8 +346,8 @@ class _Run:
         for part in parts:  # reports formats that cannot be written
             rewriter = part.rewriter
         for variant, target in enumerate(self.targets):
-            if self.work.summary(variant) is None:
-                rewriter.check_target(target, overwrite=self.work.may_replace(variant))
+            if self._summary(variant) is None:
+                rewriter.check_target(target, overwrite=self._may_replace(variant))
         if len(parts) > 1:
             self._check_several(plan)
         for index in range(min(len(parts), CHECKED_SENSORS)):
@@ -362,7 +378,7 @@ class _Run:
                 "Choose it with `--topic`, or use `actors` in an effects file."
             )
 
-    def _shared_plan(self, group: range) -> SharedPlan:
+    def _encoder(self, group: range) -> SweepEncoder:
         augmentation = self.augmentation
         effects = {number: augmentation.variants.effects(number) for number in group}
         self._add_notes(note for one in effects.values() for note in one.notes)
@@ -376,83 +392,96 @@ class _Run:
             augmentation.reflectance,
             augmentation.partial,
         )
-        key = fingerprint(dict(self.work.identity), str(self.work.folder), group.start)
-        return SharedPlan.from_plan(key, self.work, plan)
+        return SweepEncoder(plan)
+
+    def _summary(self, variant: int) -> dict[str, Any] | None:
+        """Return the summary of a variant whose copy is complete, or None."""
+        files = self.work.find(_FINISH, f"{variant:04}")
+        return None if files is None else _read_json(files[SUMMARY_FILE])
+
+    def _may_replace(self, variant: int) -> bool:
+        """Return whether the copy of a variant may be replaced if it exists.
+
+        This is the case if the user has asked for it, or if this run was stopped while it wrote the
+        copy.
+        """
+        return self.work.overwrites or self.work.find(_BEGIN, f"{variant:04}") is not None
 
     def _add_notes(self, notes: Iterable[str]) -> None:
         self._notes |= dict.fromkeys(notes)
 
-    def _augment_group(self, group: range, run: MapFunction) -> None:
+    def _augment_group(self, group: range, encoder: SweepEncoder, run: MapFunction) -> None:
         """Augment the missing sweeps of some variants, and write their copies."""
-        variants = [number for number in group if self.work.summary(number) is None]
+        variants = [number for number in group if self._summary(number) is None]
         self._done += self._count * (len(group) - len(variants))
         if not variants:
             return
-        shared = self._shared_plan(group)
-        missing = [*self._missing(variants, open_plan(shared).all_parts())]
-        pending = sum(len(sweep.variants) for sweep in missing)
-        self._done += self._count * len(variants) - pending
-        self._show_progress()
-        results = run(augment_sweeps, self._tasks(shared, missing))
-        for encoded in _closed_iteration(results):
-            if encoded.files is not None:
-                self.work.write(encoded.files)
-            self._add_notes(encoded.notes)
-            self._done += encoded.finished
-            self._show_progress()
-        self._check_unchanged()
+        sweeps = [
+            PlannedSweep(variant, part, number)
+            for part, count in enumerate(self._counts)
+            for number in range(count)
+            for variant in variants  # the sweep is read once
+        ]
+        keys = [sweep.key for sweep in sweeps]
+        stored = self.work.count(_ENCODE)
+        missing = (len(sweeps) - stored) // len(variants)
+        chunk = min(missing // _MIN_TASKS + 1, _TASK_SWEEPS) * len(variants)
+        self._show_progress(stored)
+        counts: dict[int, list[dict[str, Any]]] = {variant: [] for variant in variants}
+        with closing(self.work.each(_ENCODE, run, encoder, sweeps, keys, chunk)) as results:
+            for done, (sweep, files) in enumerate(zip(sweeps, results, strict=True), 1):
+                summary = _read_json(files[SUMMARY_FILE])
+                self._add_notes(summary.pop("notes"))
+                counts[sweep.variant].append(summary)
+                if done > stored:
+                    self._show_progress(done)
+        self._done += len(sweeps)
         for variant in variants:
-            self._write_copy(variant, open_plan(shared).all_parts())
+            self._write_copy(variant, encoder.process, PointCounts.total(counts[variant]))
 
-    def _show_progress(self) -> None:
-        self.progress(self._done, self._total)
+    def _show_progress(self, done: int) -> None:
+        """Report the number of finished sweeps, including those of a group."""
+        self.progress(self._done + done, self._total)
 
-    def _missing(
-        self, variants: Sequence[int], parts: Sequence[PartProcess]
-    ) -> Iterator[PlannedSweep]:
-        """Yield the sweeps that are not encoded, with their variants."""
-        work = self.work
-        for index, part in enumerate(parts):
-            rewriter = part.rewriter
-            folders = [(variant, work.encoded(variant, index)) for variant in variants]
-            for number in range(self._counts[index]):
-                missing = [v for v, folder in folders if not rewriter.is_written(folder, number)]
-                if missing:
-                    yield PlannedSweep(index, number, tuple(missing))
-
-    def _tasks(self, shared: SharedPlan, missing: Sequence[PlannedSweep]) -> Iterator[SweepTask]:
-        """Yield tasks of consecutive sweeps, which are read in a single pass."""
-        size = min(len(missing) // _MIN_TASKS + 1, _TASK_SWEEPS)
-        for start in range(0, len(missing), size):
-            yield SweepTask(shared, tuple(missing[start : start + size]))
-
-    def _check_unchanged(self) -> None:
-        """Raise LidarError if the recording has changed since the run began."""
-        path = self.augmentation.file.path
-        if fingerprint_files(path) != self.work.identity["recording"]:
-            raise LidarError(
-                f"{path} was changed while it was augmented. Start again with `--overwrite`."
-            )
-
-    def _write_copy(self, variant: int, parts: Sequence[PartProcess]) -> None:
+    def _write_copy(self, variant: int, process: PlanProcess, counts: PointCounts) -> None:
         """Write the copy of a variant, and remove its encoded sweeps."""
         work = self.work
-        counts = PointCounts.total(
-            work.counts(variant, index, number)
-            for index, count in enumerate(self._counts)
-            for number in range(count)
-        )
-        overwrite = work.begin_output(variant)
         (first, folder), *others = (
-            (part.rewriter, work.encoded(variant, index)) for index, part in enumerate(parts)
+            (part.rewriter, work.folder(_ENCODE) / encoded_folder(variant, index))
+            for index, part in enumerate(process.all_parts())
         )
-        notes = first.finish(self.targets[variant], folder, overwrite=overwrite, others=others)
-        work.end_output(variant, counts.to_json() | {"notes": list(notes)})
+        target = self.targets[variant]
+        first.check_target(target, overwrite=self._may_replace(variant))
+        is_campaign = self.augmentation.variants.is_campaign
+        # The table of an earlier campaign would not belong to the new copy.
+        with work.publishing_whole(target, [TABLE_FILE] if is_campaign else []) as staged:
+            notes = first.finish(staged, folder, others)
+            work.once(_BEGIN, dict, f"{variant:04}")
+            if is_campaign:
+                work.once(_REMOVE, partial(self._find_earlier, target.parent))
+        summary = counts.to_json() | {"notes": notes}
+        content = {SUMMARY_FILE: json.dumps(summary).encode()}
+        work.once(_FINISH, lambda: content, f"{variant:04}")
+        work.forget(_ENCODE, f"{variant:04}")
 
-    def _summary(self, out: Path) -> AugmentedRecording:
-        """Write the table of a campaign, remove the work folder, and return a summary."""
+    def _find_earlier(self, out: Path) -> dict[str, bytes]:
+        """Return the names of the copies of an earlier campaign that are not replaced."""
+        kept = {target.name for target in self.targets}
+        return {
+            name: b""
+            for name in outputs_in_table(out / TABLE_FILE)
+            if name not in kept and ((out / name).is_file() or (out / name / MARK_FILE).exists())
+        }
+
+    def _remove_earlier(self, out: Path) -> None:
+        """Remove the copies of an earlier campaign that are not replaced."""
+        for name in self.work.find(_REMOVE, ONCE) or ():
+            Storage.at(out).discard(name)
+
+    def _end(self, out: Path) -> AugmentedRecording:
+        """Write the table of a campaign, remove the stored results, and return a summary."""
         variants = self.augmentation.variants
-        summaries = [self.work.summary(number) or {} for number in range(variants.count)]
+        summaries = [self._summary(number) or {} for number in range(variants.count)]
         self._add_notes(chain.from_iterable(summary["notes"] for summary in summaries))
         table = None
         if variants.is_campaign:
@@ -465,6 +494,7 @@ class _Run:
                 }
                 for summary in summaries
             ]
+            self._remove_earlier(out)
             names = [target.name for target in self.targets]
             Storage(str(out)).write(TABLE_FILE, variants_table(variants, names, columns))
         self.work.remove()
@@ -484,31 +514,11 @@ def _overlap(numbers: range, count: int) -> int:
     return max(0, min(numbers.stop, count) - numbers.start)
 
 
-@dataclass(frozen=True)
-class _KeptFolder:
-    """Context that keeps a work folder with sweeps if the body fails, or else removes it."""
-
-    work: WorkFolder
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
-        if error is None:
-            return
-        if self.work.has_sweeps:
-            error.add_note(
-                f"Finished sweeps are stored in {self.work.folder}. Continue with `--resume`."
-            )
-        else:
-            self.work.remove()
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
 
 
-def _closed_iteration(results: Iterable[EncodedFiles]) -> Iterator[EncodedFiles]:
-    """Iterate over the results of a map, and cancel waiting tasks if the iteration stops early."""
-    try:
-        yield from results
-    finally:
-        close = getattr(results, "close", None)
-        if close is not None:
-            close()
+def _read_json(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(path.read_bytes())
+    return content

@@ -1,4 +1,4 @@
-"""Tasks of worker processes, which augment and encode sweeps.
+"""Augment and encode sweeps in worker processes.
 
 The files of a sweep depend only on the recording and the effects, so they are the same in all
 processes.
@@ -7,8 +7,8 @@ processes.
 from __future__ import annotations
 
 import json
-import pickle
 import socket
+import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -27,7 +27,6 @@ from lidarsim.sensor import Sensor
 
 from ..clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
 from ..clouds.writing import ExportSpec
-from ..processes.per_process import PerProcess
 from ..recordings.opening import open_recording
 from ..work.mapping import describe_sweeps
 from .augmented_sweep import AugmentedSweep
@@ -36,14 +35,18 @@ from .conversion import FormatConverter
 from .effects import Effects
 from .resampling import SensorResampler
 from .rewriting.opening import open_rewriter
-from .rewriting.rewriter import Rewriter
-from .work_folder import WorkFolder, counts_name, encoded_name
+from .rewriting.rewriter import Rewriter, sweep_folder
 
 
 @lru_cache(maxsize=4)
 def _opened(path: Path, sensor: str | None, intensity: str | None) -> Recording:
     """Open a recording. It is cached, because the sweeps of some bags must be counted."""
     return open_recording(path, sensor, intensity, keep_noise=True)
+
+
+def close_recordings() -> None:
+    """Close the recordings that this process keeps open."""
+    _opened.cache_clear()
 
 
 @dataclass(frozen=True)
@@ -127,88 +130,76 @@ class AugmentationPlan:
     partial: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class SharedPlan:
-    """A plan as bytes, which each process unpickles once.
-
-    Attributes
-    ----------
-    key
-        Identifies the plan.
-    work
-        Work folder for the encoded sweeps.
-    content
-        The pickled plan.
-    """
-
-    key: str
-    work: WorkFolder
-    content: bytes
-
-    @classmethod
-    def from_plan(cls, key: str, work: WorkFolder, plan: AugmentationPlan) -> SharedPlan:
-        """Pickle a plan."""
-        return cls(key, work, pickle.dumps(plan))
-
-
 class PlannedSweep(NamedTuple):
     """A sweep to augment."""
 
+    variant: int
     part: int  # index of the sensor in `AugmentationPlan.files`
     number: int
-    variants: tuple[int, ...]
 
-
-class SweepTask(NamedTuple):
-    """Task of augmenting sweeps."""
-
-    shared: SharedPlan
-    sweeps: tuple[PlannedSweep, ...]
+    @property
+    def key(self) -> str:
+        """Relative path under which the encoded sweep is stored."""
+        return f"{encoded_folder(self.variant, self.part)}/{sweep_folder(self.number)}"
 
     @property
     def label(self) -> str:
-        """Sweeps of the task, for messages."""
-        return describe_sweeps(self.sweeps[0].number, self.sweeps[-1].number)
+        """Name of the sweep in messages."""
+        return describe_sweeps(self.number, self.number)
 
 
-class EncodedFiles(NamedTuple):
-    """Files of the sweeps of a task."""
-
-    finished: int  # number of sweeps, which are counted once for each variant
-    notes: tuple[str, ...]
-    # {name: content} of the files in the order in which they must be written, unless the worker has
-    # written them
-    files: dict[str, bytes] | None
+def encoded_folder(variant: int, part: int) -> str:
+    """Return the relative path under which the sweeps of a variant of one sensor are stored."""
+    return f"{variant:04}/{part:04}"
 
 
-def augment_sweeps(task: SweepTask) -> EncodedFiles:
-    """Augment and encode sweeps, and write their files if the work folder is accessible.
+SUMMARY_FILE = ".summary.json"  # point counts and notes, stored with the files of each sweep
 
-    Raises
-    ------
-    LidarError
-        If the recording cannot be read, or if the format cannot store the points.
+
+class SweepEncoder:
+    """Function that augments and encodes sweeps in any process.
+
+    Each thread opens the recordings of the plan once, and keeps them as long as this object exists.
+
+    Parameters
+    ----------
+    plan
+        The augmentation.
     """
-    plan = open_plan(task.shared)
-    work = task.shared.work
-    is_accessible = work.is_accessible()
-    unwritten: dict[str, bytes] = {}
-    notes: dict[str, None] = {}
-    finished = 0
-    for sweep in task.sweeps:
-        part = plan.part(sweep.part)
-        for variant in sweep.variants:
-            folder = encoded_name(variant, sweep.part)
-            files = part.files(sweep.number, variant)
-            named = {f"{folder}/{name}": content for name, content in files.items()}
-            if is_accessible:
-                work.write(named)
-            else:
-                unwritten |= named
-            finished += 1
-        if sweep.part < CHECKED_SENSORS:
-            notes |= dict.fromkeys(part.notes())
-    return EncodedFiles(finished, tuple(notes), None if is_accessible else unwritten)
+
+    def __init__(self, plan: AugmentationPlan) -> None:
+        self.plan = plan
+        self._local = threading.local()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _received_encoder, (self.plan,)
+
+    @property
+    def process(self) -> PlanProcess:
+        """Recordings of the plan in this thread."""
+        if not hasattr(self._local, "process"):
+            self._local.process = PlanProcess(self.plan)
+        process: PlanProcess = self._local.process
+        return process
+
+    def __call__(self, sweep: PlannedSweep) -> dict[str, bytes]:
+        """Return the files of an augmented sweep.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read, or if the format cannot store the points.
+        """
+        part = self.process.part(sweep.part)
+        files, counts = part.files(sweep.number, sweep.variant)
+        notes = part.notes() if sweep.part < CHECKED_SENSORS else ()
+        summary = counts.to_json() | {"notes": notes}
+        return files | {SUMMARY_FILE: json.dumps(summary).encode()}
+
+
+def _received_encoder(plan: AugmentationPlan) -> SweepEncoder:
+    close_recordings()  # they may have changed since an earlier augmentation in this process
+    return SweepEncoder(plan)
 
 
 @dataclass(eq=False)
@@ -320,16 +311,13 @@ class PartProcess:
     def _is_chosen(self, number: int) -> bool:
         return self.plan.numbers is None or number in self.plan.numbers
 
-    def files(self, number: int, variant: int) -> dict[str, bytes]:
-        """Return the files of a sweep in the order in which they must be written."""
+    def files(self, number: int, variant: int) -> tuple[dict[str, bytes], PointCounts]:
+        """Return the files and the point counts of an augmented sweep."""
         augmented = self.augmented(number, variant)
         counts = PointCounts()
         if self._is_chosen(number):
             counts = PointCounts.from_sweep(self.recording[number], augmented)
-        return {
-            counts_name(number): json.dumps(counts.to_json()).encode(),
-            **self.rewriter.sweep_files(number, augmented),
-        }
+        return self.rewriter.sweep_files(number, augmented), counts
 
     def release(self) -> None:
         """Release the augmenters and the last sweep."""
@@ -378,11 +366,11 @@ class Resampler:
 
 # Number of sensors that are checked before the first sweep is augmented, and whose notes are shown.
 CHECKED_SENSORS = 4
-MAX_VARIANTS = 8  # maximum number of variants of a task, whose augmenters are in memory
+MAX_VARIANTS = 8  # maximum number of variants whose augmenters are in memory
 
 
 class PlanProcess:
-    """Recordings of a plan in one process. Only the sweeps of one recording are in memory."""
+    """Recordings of a plan. Only the sweeps of one recording are in memory."""
 
     def __init__(self, plan: AugmentationPlan) -> None:
         self.plan = plan
@@ -401,26 +389,6 @@ class PlanProcess:
     def all_parts(self) -> list[PartProcess]:
         """Return the recordings of all sensors."""
         return [self.part(index) for index in range(len(self.plan.files))]
-
-
-_processes = PerProcess[dict[str, PlanProcess]](dict)
-
-
-def open_plan(shared: SharedPlan) -> PlanProcess:
-    """Return the state of a plan in this process, which keeps only the most recent plan."""
-    states = _processes()
-    if shared.key not in states:
-        if states:
-            close_plans()
-        plan = pickle.loads(shared.content)  # noqa: S301 - from the driver of the command
-        states[shared.key] = PlanProcess(plan)
-    return states[shared.key]
-
-
-def close_plans() -> None:
-    """Release the recordings and augmenters that this process keeps."""
-    _processes().clear()
-    _opened.cache_clear()
 
 
 def unchanged_sweep(sweep: Sweep) -> AugmentedSweep:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -131,6 +132,19 @@ class CampaignVariants(Variants):
     def split(self, number: int) -> str:
         """Return the split of a variant, or an empty string if there are no splits."""
         return self._splits(number)
+
+
+_OUTPUT = re.compile(r"\d{4,}(\.[\w.]+)?")
+
+
+def outputs_in_table(table: Path) -> list[str]:
+    """Return the names of the outputs in a table, or an empty list if there is none."""
+    try:
+        with table.open(newline="") as file:
+            names = [row[0] for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return []
+    return [name for name in names if _OUTPUT.fullmatch(name)]
 
 
 def variants_table(

@@ -245,6 +245,7 @@ class _Placement(NamedTuple):
 @options.scheduler
 @options.workers
 @options.flag("--resume", help="Resume an unfinished augmentation, if there is one.")
+@options.flag("--restart", help="Discard an unfinished augmentation and start again.")
 @overwrite
 @options.flag("--quiet", "-q", help="Do not show progress.")
 @options.as_json
@@ -265,6 +266,7 @@ def augment(
     files: TlsFiles,
     workers: int | None,
     resume: bool,
+    restart: bool,
     overwrite: bool,
     quiet: bool,
     as_json: bool,
@@ -285,8 +287,8 @@ def augment(
       lidarpool augment nuscenes campaign.yaml --out variants --scheduler tcp://127.0.0.1:8786
       lidarpool augment pandar128.mcap --out vlp16 --sensor velodyne/vlp16
     """  # noqa: D301 - Click requires the character \b
-    if resume and overwrite:
-        raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
+    if resume and restart:
+        raise click.UsageError("`--resume` and `--restart` cannot be combined.")
     options.check_workers(workers, scheduler)
     if partial and sensor is None:
         raise click.UsageError("`--partial` requires `--sensor`.")
@@ -322,6 +324,7 @@ def augment(
             client=connected,
             workers=workers,
             resume=resume,
+            restart=restart,
             overwrite=overwrite,
             progress=lambda done, total: show("augment", done, total, "sweeps"),
         )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import cloudpickle
 import dask
 from distributed import Client, KilledWorker
 from distributed.client import FutureCancelledError
@@ -48,10 +49,16 @@ def is_connection_lost(client: Client, error: BaseException) -> bool:
     return client.status != "running"
 
 
+def _call(function: Callable[[Any], Any], item: Any) -> Any:
+    return function(item)
+
+
 def _map(client: Client, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
     address = getattr(client.scheduler, "address", "")
+    # Each process unpickles the function once, so that the function can keep open files.
+    setup = partial(cloudpickle.loads, cloudpickle.dumps(function))
     try:
-        yield from Partition(_PARTITION, client).map(function, items, chunk=1)
+        yield from Partition(_PARTITION, client).map(_call, items, chunk=1, setup=setup)
     except LidarError:
         raise
     except KilledWorker as error:

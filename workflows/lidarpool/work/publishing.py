@@ -34,6 +34,7 @@ def move_into_place(
     *,
     last: str,
     remove: Iterable[str] = (),
+    outdated: Iterable[str] = (),
     on_written: Callable[[], object] = lambda: None,
 ) -> None:
     """Move all files and folders in a staging folder to the folder or storage of the result.
@@ -55,6 +56,8 @@ def move_into_place(
         others. Pages are moved shortly before.
     remove
         Further files and folders of an earlier result to remove.
+    outdated
+        Further files that mark a complete result, and are removed before it changes.
     on_written
         Function that is called when all files are in place, before a pending interrupt is raised.
     """
@@ -77,6 +80,9 @@ def move_into_place(
             storage.discard(name)
 
     with _prepared(staged, storage, last) as move, defer_interrupts():
+        for name in outdated:
+            storage.discard(name)
+        _flush(storage)
         if names or obsolete or last in folders:
             discard(last)
             _flush(storage)  # a crash must not leave an earlier `last` beside other changes

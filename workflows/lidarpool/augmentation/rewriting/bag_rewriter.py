@@ -29,6 +29,7 @@ from lidarsim.columns.bags import (
 )
 from lidarsim.errors import CutShortError
 from lidarsim.io.input_files import read_input_text
+from lidarsim.io.storage import Storage
 from lidarsim.words import plural
 
 from ...clouds.recording import Recording, RecordingSource, sweep_from_columns
@@ -148,7 +149,8 @@ class BagRewriter(Rewriter):
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the bag, message by message."""
         notes = organization_notes(encoded.details())
-        if base == target:
+        is_again = base == target
+        if is_again:
             base = target.with_name(f"previous-{target.name}")
             target.rename(base)
         has_boxes = any(sweep["boxes"] for sweep in encoded.details())
@@ -157,6 +159,8 @@ class BagRewriter(Rewriter):
             topic = bag_copy.write(has_boxes=has_boxes)
             if self.path.is_dir():
                 notes += copy_data_set(base, target, bag_copy.files())
+        if is_again:
+            Storage.at(base.parent).discard(base.name)
         if topic is not None:
             notes.append(
                 f"The boxes of inserted objects are published on {topic} as a MarkerArray in the "
@@ -269,9 +273,10 @@ class _BagCopy:
 
     def _contents(self, number: int, topic: str | None) -> NewContent:
         """Return the new content of a message, and the boxes that follow it."""
-        folder = self._encoded.folder
-        data = (folder / _message_file(number)).read_bytes()
-        boxes = None if topic is None else (folder / _marker_file(number)).read_bytes()
+        data = self._encoded.path(number, _message_file(number)).read_bytes()
+        boxes = None
+        if topic is not None:
+            boxes = self._encoded.path(number, _marker_file(number)).read_bytes()
         return NewContent(data, boxes)
 
     @cached_property

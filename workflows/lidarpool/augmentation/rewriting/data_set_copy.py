@@ -10,14 +10,12 @@ import os
 import shutil
 import stat
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
+from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.words import list_names, plural
-
-from ...work.publishing import publishing
 
 # A folder that contains this file was written by this program, which may therefore replace it.
 MARK_FILE = ".lidarpool-augmented"
@@ -157,17 +155,3 @@ def check_target(target: Path, source: Path, *, overwrite: bool) -> None:
             f"The folder {target} was not written by `lidarpool augment`, so it is not replaced. "
             "Remove it, or use another path."
         )
-
-
-@contextmanager
-def new_target(target: Path) -> Iterator[Path]:
-    """Yield the path at which a file or folder is created before it is moved to its target.
-
-    An existing target is replaced (see `check_target`). Nothing is left behind after an error.
-    """
-    with explain_os_errors(f"{target} cannot be written"), publishing(target) as folder:
-        # The file has its final name, because bags contain the name of their file.
-        staged = folder / target.name
-        yield staged
-        if staged.is_dir():
-            (staged / MARK_FILE).write_text("Written by lidarpool augment.\n")

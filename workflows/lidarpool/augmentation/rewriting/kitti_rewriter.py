@@ -109,15 +109,15 @@ class KittiRewriter(Rewriter):
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the file, or the folder with all files of the data set."""
         if not self.path.is_dir():
-            place_file(encoded.folder / self.path.name, target)
+            place_file(encoded.path(0, self.path.name), target)
             has_labels = (self._folder / "labels" / f"{self.path.stem}.label").exists()
             return [_SINGLE_FILE] if has_labels else []
-        names = encoded.names()
+        files = encoded.files()
         notes = self._notes(encoded)
         if base != target:
-            notes += copy_data_set(base, target, names)
-        for name in sorted(names):
-            place_file(encoded.folder / name, target / name)
+            notes += copy_data_set(base, target, files)
+        for name, path in files.items():
+            place_file(path, target / name)
         tracks_file = target / f"label_02/{self._folder.name}.txt"
         tracks = [line for sweep in encoded.details() for line in sweep.get("tracks", ())]
         if tracks and tracks_file.exists():

@@ -132,10 +132,10 @@ class NuScenesRewriter(Rewriter):
         """Write the folder with all files of the data set."""
         folder = self._tables.folder.name
         tables = _AnnotationTables(NuScenesTables(base / folder), self._rows, self.source.name)
-        names = encoded.names()
-        notes = [] if base == target else copy_data_set(base, target, names)
-        for name in sorted(names):
-            place_file(encoded.folder / name, target / name)
+        files = encoded.files()
+        notes = [] if base == target else copy_data_set(base, target, files)
+        for name, path in files.items():
+            place_file(path, target / name)
         for details in encoded.details():
             tables.add_new_categories(details)
         for details in encoded.details():

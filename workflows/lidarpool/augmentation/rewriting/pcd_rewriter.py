@@ -61,10 +61,10 @@ class PCDRewriter(Rewriter):
         if any(sweep["boxes"] for sweep in encoded.details()):
             notes.append("PCD files cannot store the boxes of inserted objects.")
         if not self.path.is_dir():
-            place_file(encoded.folder / self.path.name, target)
+            place_file(encoded.path(0, self.path.name), target)
             return notes
-        names = encoded.names()
-        notes += copy_data_set(base, target, names)
-        for name in sorted(names):
-            place_file(encoded.folder / name, target / name)
+        files = encoded.files()
+        notes += copy_data_set(base, target, files)
+        for name, path in files.items():
+            place_file(path, target / name)
         return notes

@@ -1,8 +1,8 @@
 """Base class of the formats in which an augmented copy of a recording can be written.
 
 Sweeps are encoded independently of each other by any number of processes, and their files are
-collected in a work folder. The files of a sweep do not depend on other sweeps, so an interrupted
-run can be resumed. The driver assembles the data set from the work folder.
+collected in a folder. The files of a sweep do not depend on other sweeps, so an interrupted run can
+be resumed. The driver assembles the data set from the folder.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lidarsim.environment.extras import reading
-from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import Storage
+from lidarsim.errors import LidarError
 from lidarsim.words import list_names, plural
 
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
-from .data_set_copy import check_target, new_target
+from .data_set_copy import MARK_FILE, check_target
 from .stored_records import StoredRecords
 
 _LONG_ENDINGS = (".pcd.bin",)  # endings of files whose format the suffix does not determine
-DETAILS_FOLDER = ".details"  # folder in the work folder, with one JSON file per sweep
+DETAILS_FILE = ".details.json"  # stored with the other files of each sweep
 
 
 @dataclass(frozen=True)
 class EncodedSweeps:
-    """Encoded sweeps in a work folder.
+    """Encoded sweeps of a recording.
 
     Attributes
     ----------
     folder
-        Folder that contains the files that `Rewriter.sweep_files` returned.
+        Folder that contains a subfolder for each sweep, with the files that `Rewriter.sweep_files`
+        returned.
     count
         Number of sweeps in the recording.
     """
@@ -45,32 +45,27 @@ class EncodedSweeps:
     folder: Path
     count: int
 
-    def missing(self) -> list[int]:
-        """Return the numbers of the sweeps that are not encoded yet."""
-        details = (self.folder / details_name(number) for number in range(self.count))
-        return [number for number, path in enumerate(details) if not path.exists()]
+    def path(self, number: int, name: str) -> Path:
+        """Return the path of an encoded file of a sweep."""
+        return self.folder / sweep_folder(number) / name
 
     def details(self) -> Iterator[dict[str, Any]]:
         """Yield the details of all sweeps in order."""
         for number in range(self.count):
-            yield json.loads((self.folder / details_name(number)).read_bytes())
+            yield json.loads(self.path(number, DETAILS_FILE).read_bytes())
 
-    def names(self) -> set[str]:
-        """Return the names of all encoded files of the data set."""
-        return {name for details in self.details() for name in details["files"]}
-
-    def check_complete(self) -> None:
-        """Raise LidarError if a sweep is missing."""
-        if missing := self.missing():
-            raise LidarError(
-                f"{len(missing):,} of {plural(self.count, 'sweep')} have not been augmented yet, "
-                f"starting with sweep {missing[0]}. Continue with `--resume`."
-            )
+    def files(self) -> dict[str, Path]:
+        """Return the paths of all encoded files of the data set, keyed by name."""
+        return {
+            name: self.path(details["number"], name)
+            for details in self.details()
+            for name in details["files"]
+        }
 
 
-def details_name(number: int) -> str:
-    """Return the name of the file with the details of a sweep."""
-    return f"{DETAILS_FOLDER}/{number:08}.json"
+def sweep_folder(number: int) -> str:
+    """Return the name of the folder with the encoded files of a sweep."""
+    return f"{number:08}"
 
 
 class Rewriter(ABC):
@@ -99,7 +94,7 @@ class Rewriter(ABC):
     ) -> tuple[dict[str, bytes], dict[str, Any]]:
         """Return the files of a sweep, and JSON-serializable details for `assemble`.
 
-        The names of the files are relative to the work folder.
+        The names of the files are relative to the data set.
         """
 
     @abstractmethod
@@ -130,8 +125,6 @@ class Rewriter(ABC):
         """Return the encoded files of an augmented sweep, keyed by name.
 
         The files depend only on the recording and on this sweep, and are the same in all processes.
-        The last file contains the details of the sweep. If files are written in this order, the
-        sweep is complete when its last file exists.
 
         Parameters
         ----------
@@ -148,23 +141,7 @@ class Rewriter(ABC):
         with reading(self.recording.name):
             files, details = self.encode(number, augmented)
         details |= {"number": number, "files": sorted(files), "points": len(augmented.sweep)}
-        return files | {details_name(number): json.dumps(details).encode()}
-
-    def write_sweep(self, encoded: Path, number: int, augmented: AugmentedSweep) -> None:
-        """Write the encoded files of a sweep to a work folder.
-
-        Raises LidarError like `sweep_files`, or if a file cannot be written.
-        """
-        files = self.sweep_files(number, augmented)
-        storage = Storage(str(encoded), durable=False)
-        with explain_os_errors(f"{encoded} cannot be written"):
-            for name, content in files.items():
-                storage.prepare(Path(name).parent)
-                storage.write(name, content)
-
-    def is_written(self, encoded: Path, number: int) -> bool:
-        """Return whether a work folder contains all files of a sweep."""
-        return (encoded / details_name(number)).exists()
+        return files | {DETAILS_FILE: json.dumps(details).encode()}
 
     @property
     def ending(self) -> str:
@@ -186,29 +163,22 @@ class Rewriter(ABC):
             )
 
     def finish(
-        self,
-        target: Path,
-        encoded: Path,
-        *,
-        overwrite: bool = False,
-        others: Sequence[tuple[Rewriter, Path]] = (),
+        self, target: Path, encoded: Path, others: Sequence[tuple[Rewriter, Path]] = ()
     ) -> list[str]:
         """Write the augmented copy of the recording from the encoded sweeps.
 
-        The copy is written completely or not at all. Sweeps are read one after the other. The work
-        folder is not modified, so the caller can remove it afterwards.
+        Sweeps are read one after the other, and are not modified.
 
         Parameters
         ----------
         target
-            File or folder to write, depending on the kind of the recording.
+            File or folder to write, depending on the kind of the recording. It does not exist, and
+            nothing else is in its folder.
         encoded
-            Work folder with the encoded files of all sweeps.
-        overwrite
-            Whether to replace a file, or a folder that was written by this method.
+            Folder with the encoded files of all sweeps (see `EncodedSweeps`).
         others
-            Rewriters of other sensors in the same recording, with their work folders. Their sweeps
-            are written to the same target.
+            Rewriters of other sensors in the same recording, with their folders. Their sweeps are
+            written to the same target.
 
         Returns
         -------
@@ -217,23 +187,20 @@ class Rewriter(ABC):
         Raises
         ------
         LidarError
-            If a sweep is missing, or if the target exists or cannot be written.
+            If the recording cannot be read.
         """
         parts = [
             (rewriter, EncodedSweeps(folder, len(rewriter.recording)))
             for rewriter, folder in ((self, encoded), *others)
         ]
-        for _, sweeps in parts:
-            sweeps.check_complete()
-        self.check_target(target, overwrite=overwrite)
-        chosen = [rewriter.sensor for rewriter, _ in parts]
-        notes = self._sensor_notes(chosen)
-        with new_target(target) as staged:
-            base = self.path
-            for rewriter, sweeps in parts:
-                with reading(self.source.name):
-                    notes += rewriter.assemble(staged, sweeps, base)
-                base = staged
+        notes = self._sensor_notes([rewriter.sensor for rewriter, _ in parts])
+        base = self.path
+        for rewriter, sweeps in parts:
+            with reading(self.source.name):
+                notes += rewriter.assemble(target, sweeps, base)
+            base = target
+        if target.is_dir():
+            (target / MARK_FILE).write_text("Written by lidarpool augment.\n")
         return list(dict.fromkeys(notes))
 
     def _sensor_notes(self, chosen: Sequence[str]) -> list[str]:
