@@ -12,10 +12,10 @@ from typing import Any, Protocol
 from dask.utils import funcname
 from distributed import Client, Future, wait
 
-from .errors import PipeFailed, PoolError
+from .errors import PipeFailed, PoolError, TaskTimeoutError
 from .membership import request_capacity
 from .pipe import Pipe, take_items
-from .setups import FunctionWithSetup, StageSetup
+from .setups import SETUP_COUNTS, FunctionWithSetup, StageSetup
 from .worker_wait import WorkerWait, check_wait_s
 
 CHECK_S = 5.0  # interval between requests for the number of slots
@@ -233,4 +233,6 @@ class ItemTasks:
                         f"poolpart: The error occurred for item {number} of {self._items.name}: "
                         f"{shown}"
                     )
+                    if self._setup is not None and isinstance(error, TaskTimeoutError):
+                        error.add_note(f"poolpart: {SETUP_COUNTS}")
                     raise

@@ -32,7 +32,7 @@ from .errors import PoolError, TaskTimeoutError
 from .internals.client import call_when_done, gather, lend_slots
 from .map_lead import LeadTime
 from .membership import PartitionCapacity, request_capacity
-from .setups import StageSetup
+from .setups import SETUP_COUNTS, StageSetup
 from .worker_wait import WAIT_S, WorkerWait, check_wait_s
 
 logger = logging.getLogger(__name__)
@@ -637,7 +637,7 @@ class Results(Iterator[Any]):
                     heapq.heappush(self._unfinished, (first, chunk.rows, 1))  # to find the item
                     continue
                 if isinstance(error, KilledWorker | TaskTimeoutError):
-                    _add_note(error, chunk)
+                    _add_note(error, chunk, self._stages)
                 if not (self._stages[-1].return_exceptions and _is_item_error(error)):
                     self._failed = chunk, answer
                     return
@@ -661,7 +661,9 @@ class Results(Iterator[Any]):
         raise AssertionError("the task has not failed")
 
 
-def _add_note(error: KilledWorker | TaskTimeoutError, chunk: Chunk) -> None:
+def _add_note(
+    error: KilledWorker | TaskTimeoutError, chunk: Chunk, stages: Sequence[Stage]
+) -> None:
     """Name the only item of a task whose workers have died, or that took too long."""
     shown = ", ".join(reprlib.repr(argument) for call in chunk.rows[0] for argument in call)
     note = f"The error occurred for item {chunk.first} of a map: {shown}"
@@ -670,6 +672,8 @@ def _add_note(error: KilledWorker | TaskTimeoutError, chunk: Chunk) -> None:
             f"Workers died while they processed item {chunk.first} of a map: {shown}. If workers "
             "run several tasks at a time, another task may be the cause."
         )
+    elif any(stage.setup for stage in stages):
+        note = f"{note}. {SETUP_COUNTS}"
     error.add_note(NOTE + note)
 
 

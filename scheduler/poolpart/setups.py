@@ -36,6 +36,7 @@ from .workers import run_on_scheduler
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-setups"
+SETUP_COUNTS = "The running time of a task includes the time for calling `setup`."
 WATCH_S = 0.5  # interval between checks whether a worker is paused
 MOST_ENDED = 1000  # maximum number of ended stages that a process remembers
 

@@ -15,7 +15,7 @@ from distributed import Client, Event
 from distributed.core import Status
 from tests.poolpart.helpers import LONG_S, kill, wait_for
 
-from poolpart import Partition, Pool, PoolError, rest, setups
+from poolpart import Partition, Pool, PoolError, TaskTimeoutError, rest, setups
 
 models = WeakSet()  # in this process
 
@@ -186,6 +186,24 @@ def test_its_error_is_no_error_of_an_item(b):
     with pytest.raises(FileNotFoundError) as caught:
         b.for_each([2], pow, setup=fail_first)
     assert "setup function 'fail_first'" in caught.value.__notes__[0]
+
+
+def test_an_error_says_that_loading_counts_toward_the_time_limit(a):
+    def load():
+        time.sleep(0.8)
+
+    def use(loaded, item):
+        return item
+
+    (error,) = a.map(use, [1], setup=load, timeout_s=0.2, return_exceptions=True)
+    assert isinstance(error, TaskTimeoutError)
+    assert error.__notes__[0].endswith(f": 1. {setups.SETUP_COUNTS}")
+    with pytest.raises(TaskTimeoutError) as caught:
+        a.for_each([1], use, setup=load, timeout_s=0.2)
+    assert caught.value.__notes__[-1] == f"poolpart: {setups.SETUP_COUNTS}"
+    with pytest.raises(TaskTimeoutError) as caught:
+        list(a.map(lambda _: load(), [1], timeout_s=0.2))
+    assert not any(setups.SETUP_COUNTS in note for note in caught.value.__notes__)
 
 
 def test_each_stage_of_a_chain_has_its_own(a, b):

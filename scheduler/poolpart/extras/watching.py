@@ -203,7 +203,7 @@ class TaskWatch:
             outcome = await free_worker(
                 self.scheduler, worker, name, {key}, candidates, patience_s=PATIENCE_S
             )
-            logger.warning("%s Its function did not return: %s.", error, outcome)
+            logger.warning("%s Its function did not return (%s).", error, outcome)
             if outcome.startswith("restarted"):
                 fail_pipes_of_killed_task(self.scheduler, key, annotations)
 
