@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
+from lidarpool.comparing.fit.measured import SensorMeasurement
+from lidarpool.comparing.fit.smooth_surfaces import SmoothRays
 from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
@@ -48,6 +51,73 @@ def recording():
 @pytest.fixture(scope="module")
 def fitted(recording):
     return fit(recording)
+
+
+def measured(*, tilts_deg=(10.0, 20.0, 30.0), **fields):
+    """Return a measurement of 60 rays in each of three rings, with values by formulas."""
+    row = np.repeat(np.arange(3), 60)
+    distance = np.tile(np.linspace(5, 30, 60), 3)
+    rays = SmoothRays(
+        row=row,
+        column=np.tile(np.arange(60), 3),
+        distance=distance,
+        slope=distance * np.tan(np.radians(tilts_deg))[row],
+        intensity=100 / distance,
+        return_counts=np.full(180, 7),
+        trials=np.full(180, 10),
+        variance=0.01**2 * (row + 1) ** 2
+        + (np.radians(0.1) * distance * np.tan(np.radians(25))) ** 2,
+        freedom=np.where(np.arange(180) % 60 < 10, 0, 6),
+    )
+    offsets = np.zeros((4, 3, 60), np.float32)
+    offsets[:, 1] = np.radians(0.02) * np.arange(60)  # 0.02° from column to column
+    stack = SimpleNamespace(
+        sweep_count=4, azimuth_offsets=offsets, rings=[5, 3, 8], elevation_deg=[3.0, 1.0, -7.5]
+    )
+    defaults = {"energy": None, "estimates": {}, "bias": {1: Estimate(0.02, 0.01, 0.03)}}
+    return SensorMeasurement(stack, rays, **defaults | fields)
+
+
+def test_curves_have_the_values_of_the_rays():
+    one = measured(tilts_deg=[25.0] * 3, estimates={"angle_deg": Estimate(0.1, 0.0, 0.2)})
+    curves = one.curves()
+    # Without the contribution of directions, which is greater on steeper surfaces.
+    noise_m = [point["value"] for point in curves["noise_by_range"]]
+    expected_m = 0.01 * np.sqrt((1 + 4 + 9) / 3)
+    assert noise_m == pytest.approx([expected_m] * len(noise_m), rel=0.1)
+    assert all(point["low"] < point["value"] < point["high"] for point in curves["noise_by_range"])
+    for point in curves["light_by_range"]:
+        assert point["value"] == pytest.approx(100 / point["x"], rel=0.08)
+    assert all(point["value"] == pytest.approx(0.7) for point in curves["returned_by_light"])
+    assert "lost_by_range" not in curves
+    lost = [{"x": 9.0, "value": 0.1, "low": 0.0, "high": 0.2}]
+    assert replace(one, lost_by_range=lost).curves()["lost_by_range"] == lost
+    bright = replace(one, energy=np.linspace(2, 3, 180)).curves()
+    assert all(2 <= point["x"] <= 3 for point in bright["noise_by_light"])
+    # Single returns have no variance.
+    alone = replace(one, rays=one.rays._replace(freedom=np.zeros(180, int)))
+    assert alone.curves()["noise_by_tilt"] == []
+    tilts = [point["x"] for point in measured().curves()["noise_by_tilt"]]
+    assert sorted(tilts) == tilts
+    assert min(tilts) == pytest.approx(10) and max(tilts) == pytest.approx(30)
+
+
+def test_channels_have_the_values_of_their_rays():
+    first, second, third = measured().channels()
+    assert [one["ring"] for one in (first, second, third)] == [5, 3, 8]
+    assert [one["elevation_deg"] for one in (first, second, third)] == [3.0, 1.0, -7.5]
+    assert {one["rays"] for one in (first, second, third)} == {50}
+    assert first["bias_m"] is third["bias_m"] is None
+    assert second["bias_m"] == {"value": 0.02, "low": 0.01, "high": 0.03}
+    # The variance of the difference of two azimuths is twice that of one.
+    assert second["uneven_deg"]["value"] == pytest.approx(0.02 / np.sqrt(2), rel=1e-3)
+    assert first["uneven_deg"]["value"] == 0
+    assert [one["uneven_deg"] for one in measured(moves=True).channels()] == [None] * 3
+    steep = measured(
+        tilts_deg=[25.0] * 3, estimates={"angle_deg": Estimate(0.1, 0.0, 0.2)}
+    ).channels()
+    noise_m = [one["noise_m"]["value"] for one in steep]
+    assert noise_m == pytest.approx([0.01, 0.02, 0.03], rel=1e-6)
 
 
 @pytest.mark.slow

@@ -660,6 +660,22 @@ sensors:
     assert custom[0].__msgtype__ == "livox_ros_driver2/msg/CustomMsg"
 
 
+def test_a_sensor_without_a_name_has_the_topic_points(folder):
+    (folder / "sensors.yaml").write_text("sensor: velodyne/vlp16\nmount: [0, 0, 1]\n")
+    with Loop("room.sdf") as loop:
+        (one,) = loop.node._sensors
+        assert (one.name, one.topic) == (one.published_frame, "/points")
+    (folder / "sensors.yaml").write_text(
+        "sensors: {roof: {model: velodyne/vlp16, mount: [0, 0, 1]}, 'the nose': velodyne/vlp16}"
+    )
+    with Loop("room.sdf") as loop:
+        names = [one.name for one in loop.node._sensors]
+        topics = [one.topic for one in loop.node._sensors]
+    assert names == ["roof", "the nose"]
+    assert topics == [f"/{one.published_frame}/points" for one in loop.node._sensors]
+    assert topics[0] == "/roof/points"
+
+
 def notes_of(loop: Loop, part: str) -> list[str]:
     return [note for note in loop.notes if part in note]
 

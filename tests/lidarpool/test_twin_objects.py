@@ -345,7 +345,7 @@ def test_labeled_objects_keep_their_tracks_without_points(is_labeled):
 def ground_around(track, heights, count=400):
     """Return stationary returns around a box, in the frame of the box, and at its first time."""
     random = np.random.default_rng(5)
-    x, y = random.uniform(-3.4, 3.4, (2, count))
+    x, y = random.uniform(-2.9, 2.9, (2, count))
     beside = (np.abs(x) > 2) | (np.abs(y) > 1)
     local = np.column_stack([x, np.clip(y, -1.9, 1.9), random.choice(heights, count)])[beside]
     positions, yaw = track.poses(np.zeros(len(local)))
@@ -382,9 +382,27 @@ def test_boxes_reach_the_ground_around_them(heights, expected_m):
         (track.positions - found.positions)[1], [0, 0, expected_m], atol=1e-9
     )
     np.testing.assert_allclose(found.size - SIZE, [0, 0, expected_m], atol=1e-9)
+    rays = ground_around(track, heights)
     # Too few returns do not determine it.
-    few = ground_around(track, heights)
-    assert _on_ground(track, few.select(slice(0, 19))) is track
+    assert _on_ground(track, rays.select(slice(0, 19))) is track
+    same = ground_around(track, heights[:1])
+    assert _on_ground(track, same.select(slice(0, 20))).size[2] - SIZE[2] == pytest.approx(
+        max(-heights[0], 0)
+    )
+    # Neither do lost pulses, moving points, the object itself, and what is farther away.
+    lower = same._replace(ends=same.ends - [0, 0, 0.1])
+    local = rotate_z(same.ends - at, np.full(len(same.sweep), -0.7))
+    on_object = at + rotate_z(local * [0.55, 0.5, 1.4], np.full(len(local), 0.7))
+    beyond = at + rotate_z(local * [1, 3, 1.4], np.full(len(local), 0.7))
+    beyond = np.where(np.abs(local[:, 1:2] * 3) > 2.1, beyond, on_object)
+    for others in (
+        lower._replace(returned=np.zeros(len(local), bool)),
+        lower._replace(moved=np.ones(len(local), bool)),
+        lower._replace(ends=on_object),
+        lower._replace(ends=beyond),
+    ):
+        found = _on_ground(track, MovingRays.concatenate([same, others]))
+        assert found.size[2] - SIZE[2] == pytest.approx(max(-heights[0], 0))
 
 
 def plate(x, size=1.0, dark=False):

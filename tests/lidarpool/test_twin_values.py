@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweep, Alignment
 from lidarpool.reconstruction.blocked_directions import PulseCounts
-from lidarpool.reconstruction.free_space import RangeImage, locate
+from lidarpool.reconstruction.free_space import RangeImage, find_stationary_points, locate
 from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
 from lidarpool.reconstruction.motion import Motion, MotionStep
@@ -577,3 +578,50 @@ def test_only_what_moves_with_the_sensor_is_the_vehicle(speed_m):
     # Cells next to the bonnet are its edge, up to its range.
     assert not found[~truth].any(), at[found & ~truth]
     assert vehicle.share == pytest.approx(is_bonnet.mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("has_rings", [True, False])
+def test_points_that_a_later_ray_passed_have_moved(has_rings):
+    """A sensor that turns and drives in a round hall; a box is there in one sweep of five."""
+    elevation = np.radians(np.arange(12.0, -9.0, -1.0))
+    azimuth = np.radians(np.arange(0.25, 360, 0.5))
+    rays = np.stack(np.meshgrid(elevation, azimuth, indexing="ij"), axis=-1).reshape(-1, 2)
+    local = np.column_stack(
+        [np.cos(rays[:, 0]) * np.cos(rays[:, 1]), np.cos(rays[:, 0]) * np.sin(rays[:, 1]),
+         np.sin(rays[:, 0])]
+    )  # fmt: skip
+    hall = np.array([480_000.0, -5_400_000.0, 300.0])
+    aligned = {}
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    boxed = {}
+    for number in range(5):
+        turn = Rotation.from_euler("z", 25 * number, degrees=True).as_matrix()
+        position = np.array([0.5 * number, -0.2 * number, 0.0])
+        toward = local @ turn.T
+        # The distance to a cylinder with a radius of 14 m.
+        level = np.hypot(toward[:, 0], toward[:, 1])
+        b = toward[:, :2] @ position[:2] / level
+        range_m = (-b + np.sqrt(b**2 - position[:2] @ position[:2] + 14**2)) / level
+        is_boxed = np.zeros(len(local), bool)
+        if number == 3:
+            direction = np.degrees(np.arctan2(toward[:, 1], toward[:, 0]))
+            is_boxed = (np.abs(direction - 70) < 8) & (np.abs(rays[:, 0]) < np.radians(5.5))
+            range_m[is_boxed] = 6.0
+        poses[number, :3, :3] = turn
+        poses[number, :3, 3] = hall + position
+        points = local * range_m[:, None]
+        aligned[number] = SimpleNamespace(points=points, world=points @ turn.T + hall + position)
+        boxed[number] = is_boxed
+    lasers = RingLasers.at_origin(elevation if has_rings else np.empty(0))
+    sweeps = SimpleNamespace(
+        read=aligned.__getitem__,
+        recorded=SimpleNamespace(lasers=lasers),
+        alignment=SimpleNamespace(poses=poses),
+    )
+    masks = find_stationary_points(sweeps, [0, 1, 2, 3, 4])
+    assert [*masks] == [0, 1, 2, 3, 4]
+    assert (~masks[3])[boxed[3]].mean() > 0.9
+    for number, mask in masks.items():
+        assert mask[~boxed[number]].mean() > 0.995
+    # Without the other sweeps, nothing is known to have moved.
+    assert find_stationary_points(sweeps, [3])[3].all()

@@ -1,5 +1,6 @@
 """Tasks take slots of their partition at any depth, and lend their own while they wait."""
 
+import asyncio
 import concurrent.futures
 import logging
 import os
@@ -10,6 +11,7 @@ import sys
 import threading
 import time
 from itertools import product
+from types import SimpleNamespace
 
 import dask
 import pytest
@@ -29,7 +31,7 @@ from distributed import (
 from tests.poolpart.helpers import LONG_S, addresses, declared, join, kill, wait_for, worker_name
 
 from poolpart import Partition, Pipe, Pool, PoolError, rest
-from poolpart.extras import inherit
+from poolpart.extras import inherit, lending
 from poolpart.extras.lending import lending_plugin
 from poolpart.pipe import delete_pipes
 
@@ -615,3 +617,72 @@ def parent_of_both(name):
     client = get_client()
     futures = [client.submit(f, name, pure=False) for f in (wait_and_hand_over, start_the_other)]
     return client.gather(futures)
+
+
+def test_only_tasks_that_have_waited_long_are_checked_and_once():
+    warned = []
+
+    def call_later(_warn, key, task):
+        warned.append((key, task.key))
+
+    now = time.monotonic()
+    submitter = {name: lending.SubmittingTask(name, "tcp://a:1") for name in ("old", "new", "told")}
+    ages_s = {"old": lending.WARN_AFTER_S + 1, "new": 1, "told": lending.WARN_AFTER_S + 1}
+    lender = SimpleNamespace(
+        worker=SimpleNamespace(loop=SimpleNamespace(add_callback=call_later)),
+        update_seceded=lambda: None,
+        _nested={
+            f"nested-{name}": lending._NestedTask(submitter[name], now - age_s)
+            for name, age_s in ages_s.items()
+        },
+        _seceded=set(),
+        _warned={"told"},
+        _warn=None,
+        _next_check=object(),
+        _schedule_check=lambda: warned.append("again"),
+    )
+    lending.Lender._check_nested(lender)
+    assert warned == [("nested-old", "old"), "again"]
+    assert lender._warned == {"old", "told"} and lender._next_check is None
+    lending.Lender._check_nested(lender)
+    assert warned == [("nested-old", "old"), "again", "again"]
+    lender._nested = {}
+    lending.Lender._check_nested(lender)
+    assert len(warned) == 3 and not lender._warned, "all may be warned of again"
+    lender._seceded = {"some"}
+    lending.Lender._check_nested(lender)
+    assert warned[3:] == ["again"]
+
+
+@pytest.mark.parametrize(
+    ("answer", "waits"), [(True, True), (True, False), (False, True), (OSError(), True)]
+)
+def test_a_warning_needs_a_submitter_with_slots_and_a_task_that_still_waits(
+    monkeypatch, answer, waits
+):
+    async def ask(worker, address, function, key):
+        assert (address, key) == ("tcp://a:1", "parent")
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    events = []
+    monkeypatch.setattr(lending, "call_worker", ask)
+    monkeypatch.setattr(lending, "resources_of", lambda _: {"lidar": 1, "camera": 2})
+    lender = SimpleNamespace(
+        worker=SimpleNamespace(
+            state=SimpleNamespace(tasks={"nested": None}),
+            log_event=lambda topic, event: events.append((topic, pickle.loads(event["message"]))),
+        ),
+        _nested={"nested": None} if waits else {},
+        _warned={"parent", "other"},
+    )
+    task = lending.SubmittingTask("parent", "tcp://a:1")
+    asyncio.run(lending.Lender._warn(lender, "nested", task))
+    if answer is True and waits:
+        ((topic, message),) = events
+        assert topic == "warn" and lender._warned == {"parent", "other"}
+        assert "Task 'parent' of partition 'lidar' and 'camera' holds a slot" in message
+        assert "while task 'nested', which it has submitted, waits" in message
+    else:
+        assert not events and lender._warned == {"other"}
