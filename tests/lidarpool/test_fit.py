@@ -28,6 +28,7 @@ from lidarpool import (
 )
 from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.writing import ExportSpec
+from lidarpool.comparing.fit import search
 from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
 from lidarpool.comparing.fit.measured import SensorMeasurement
@@ -94,6 +95,12 @@ def test_curves_have_the_values_of_the_rays():
     assert replace(one, lost_by_range=lost).curves()["lost_by_range"] == lost
     bright = replace(one, energy=np.linspace(2, 3, 180)).curves()
     assert all(2 <= point["x"] <= 3 for point in bright["noise_by_light"])
+    alone = replace(one, stack=SimpleNamespace(sweep_count=1))
+    assert "returned_by_light" not in alone.curves()
+    for name, expected in (("noise_by_light", expected_m**2), ("noise_by_tilt", None)):
+        squares = [point["value"] ** 2 for point in bright[name]]
+        expected = expected or one.rays.variance[one.rays.freedom > 0].mean()
+        assert np.mean(squares) == pytest.approx(expected, rel=0.05)
     # Single returns have no variance.
     alone = replace(one, rays=one.rays._replace(freedom=np.zeros(180, int)))
     assert alone.curves()["noise_by_tilt"] == []
@@ -113,6 +120,10 @@ def test_channels_have_the_values_of_their_rays():
     assert second["uneven_deg"]["value"] == pytest.approx(0.02 / np.sqrt(2), rel=1e-3)
     assert first["uneven_deg"]["value"] == 0
     assert [one["uneven_deg"] for one in measured(moves=True).channels()] == [None] * 3
+    several = measured()
+    alone = SimpleNamespace(**vars(several.stack))
+    alone.azimuth_offsets = alone.azimuth_offsets[:1]
+    assert replace(several, stack=alone).channels()[1]["uneven_deg"] is None
     steep = measured(
         tilts_deg=[25.0] * 3, estimates={"angle_deg": Estimate(0.1, 0.0, 0.2)}
     ).channels()
@@ -881,3 +892,26 @@ def test_a_result_is_fitted_as_a_cloud_and_as_files(cluster_client, tmp_path):
     for found in (fit(cloud), fit(tmp_path / "sweeps", white=1.0)):
         one = found.figures["figures"]["range_m"]
         assert one["low"] - 0.001 < 0.02 < one["high"] + 0.001
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_motions_are_sought_along_all_free_axes_in_both_directions(count):
+    """The axes are oblique. Shifts grow to the maximum, and rotations are without a shift."""
+    axes = np.array([[2.0, 1, 2], [-2, 2, 1]])[:count] / 3
+    motions = search._coarse_motions(axes, 4.0)
+    turns = motions.yaw_rad != 0
+    assert not motions.shift[turns].any()
+    degrees = np.degrees(motions.yaw_rad[turns])
+    assert (degrees.min(), degrees.max()) == (pytest.approx(-44.75), pytest.approx(44.75))
+    shifts = motions.shift[~turns]
+    lengths = np.linalg.norm(shifts, axis=1)
+    assert (lengths.min(), lengths.max()) == (pytest.approx(0.05), pytest.approx(4.0))
+    along = shifts @ axes.T
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), lengths)
+    steps = np.unique(lengths.round(9))
+    assert (steps[1:] / steps[:-1]).max() < 1.06 and (steps[1:] / steps[:-1]).min() > 1.04
+    if count == 1:
+        assert {*np.sign(along[:, 0])} == {-1, 1}
+        return
+    angles = np.unique(np.degrees(np.arctan2(along[:, 1], along[:, 0])).round(6) % 360)
+    np.testing.assert_allclose(angles, np.arange(0, 360, 5), atol=1e-5)

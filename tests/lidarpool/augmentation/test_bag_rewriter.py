@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from functools import partial
+from types import SimpleNamespace
 
 import mcap.reader
 import mcap.writer
@@ -25,6 +26,7 @@ from tests.fake_augmenters import (
 )
 
 from lidarpool import LidarError
+from lidarpool.augmentation.rewriting import bag_rewriter
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.ros.messages import message_store
 from lidarpool.recordings.opening import open_recording
@@ -487,3 +489,28 @@ def test_damaged_chunks(written, tmp_path):
         finish(rewriter, tmp_path / "other.mcap", tmp_path / "work")
     assert not (tmp_path / "other.mcap").exists()
     assert not [*tmp_path.glob(".lidarpool*")]
+
+
+MESSAGE = "string data\n"
+IDL = """
+module std_msgs { module msg { struct String { string data; }; }; };
+"""
+# From the package std_msgs of ROS 2 Jazzy.
+STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+
+
+@pytest.mark.parametrize(
+    ("kind", "definition", "expected"),
+    [
+        ("MSG", MESSAGE, STRING),
+        ("IDL", IDL, STRING),
+        ("MSG", "unknown/Type data\n", f"RIHS01_{'0' * 64}"),
+        ("IDL", MESSAGE, f"RIHS01_{'0' * 64}"),
+    ],
+)
+def test_types_have_the_hash_of_their_definition(kind, definition, expected):
+    from rosbags.interfaces import MessageDefinitionFormat
+
+    text = SimpleNamespace(data=definition, format=MessageDefinitionFormat[kind])
+    connection = SimpleNamespace(msgtype="std_msgs/msg/String", msgdef=text)
+    assert bag_rewriter._type_hash(connection) == expected
