@@ -216,15 +216,21 @@ def test_numbers_beside_the_colors_are_whole(lower, upper, marks, scene, shot):
     assert figure.axes[0].get_ylabel() == "x (m)"
 
 
+LONGEST = max(TABLE.values(), key=lambda column: len(column.meaning) * (not column.unit)).name
+
+
 @pytest.mark.extended
-@pytest.mark.parametrize("name", ["z", "amplitude", "normal_x", "triangle", "cause", "signal"])
-def test_words_of_a_column_are_within_the_picture(name, scene, shot):
+@pytest.mark.parametrize(
+    "name", ["z", "amplitude", "normal_x", "triangle", "cause", "signal", LONGEST]
+)
+def test_words_of_a_column_are_complete_and_within_the_picture(name, scene, shot):
     column = TABLE[name]
     values = np.linspace(0, 250, len(scene.vertices)).astype(column.dtype)
     columns = {} if column in AXES else {column.name: values}
     figure = draw_cloud(shot, Cloud(scene.vertices, columns), len(values), column).figure
     figure.draw_without_rendering()
     texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+    assert not any("…" in text.get_text() for text in texts)
     for text in texts:
         box_px = text.get_window_extent()
         assert figure.bbox.x0 <= box_px.x0 and box_px.x1 <= figure.bbox.x1, text.get_text()

@@ -193,7 +193,7 @@ def draw_cloud(
         else:
             unit = f" ({colored.unit})"
             if not colored.unit:
-                unit = "\n" + fill(colored.meaning, 46, max_lines=2, placeholder=" …")
+                unit = "\n" + fill(colored.meaning, 56, max_lines=3, placeholder=" …")
             lower, upper = colored.limits
             scale = LogNorm if colored.logarithmic else Normalize
             norm = scale(lower, upper if upper > lower else lower + 1)
