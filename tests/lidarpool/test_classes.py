@@ -23,7 +23,9 @@ from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.report.charts import draw_sweep
+from lidarpool.scenario.advice import advice
 from lidarpool.scenario.field_paths import find_field
+from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -280,3 +282,18 @@ def test_the_page_names_them_in_legend_and_filter(saved, scene, sweeps, tmp_path
         told, _ = view.answer("points", asked, lambda: False)
         assert "road" in [name for name, *_ in told["legend"]["labels"]]
     assert PictureContent.load(tmp_path / PICTURE_FILE).classes[3] == "road"
+
+
+def test_classes_beyond_the_classification_of_las_are_noted(tmp_path):
+    """The classification has a byte, and the extra bytes have the true number."""
+    (tmp_path / "box.yaml").write_text(
+        "scene: {copies: [{name: A, box: [1, 9, 9], at: [[5, 0, 0]], class: 300}]}\n"
+        "materials: [{objects: '*', class: 300}]\nposes: [[0, 0, 2]]\nsensor: {layers: 8}\n"
+        "cloud: {columns: [class]}\noutput: {write: [las]}\n"
+    )
+    (note,) = (
+        note
+        for note in advice(prepare(Scenario.load(tmp_path / "box.yaml")))
+        if "classification" in note
+    )
+    assert "is at most 255, so it is 0 for points of class 300" in note

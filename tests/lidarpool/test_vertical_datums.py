@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError, compare_strips, compare_surveys
+from lidarpool.cli.commands import cli
 from lidarpool.scenario.point_scene import scene_from_points
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
@@ -120,14 +121,71 @@ def test_vertical_datums_are_compared_without_rasterio(tmp_path, monkeypatch):
         compare_surveys(a, b, method="planes")
 
 
+@pytest.fixture
+def ground_scan(tmp_path):
+    """The plane as a raster with EGM96 heights, and a station of a scan of it."""
+    raster(tmp_path / "ground.tif", "EPSG:32632+5773", height_m=100.0)
+    text = (
+        "scene: ground.tif\nworld: {epsg: 32632}\nsensor: {layers: 8}\n"
+        f"poses: [[{X0 + 10}, {Y0 + 10}, 102]]\n"
+    )
+    (tmp_path / "stations.yaml").write_text(text)
+    return tmp_path
+
+
+def measure_coverage(folder, cloud):
+    arguments = ["stations", str(folder / "stations.yaml"), "--cloud", str(cloud)]
+    cli.main(arguments, standalone_mode=False)
+
+
+UTM33 = geotiff(0).replace(struct.pack("<H", 32632), struct.pack("<H", 32633))
+
+
+@pytest.mark.parametrize(
+    ("system", "cloud", "other"),
+    [
+        (UTM33, "coordinate system EPSG:32633", "EPSG:32632"),
+        (ELLIPSOID, "ellipsoidal heights", "heights in the datum EGM96 geoid"),
+    ],
+    ids=["horizontal", "vertical"],
+)
+def test_meshes_and_scenes_in_other_systems_than_the_cloud_are_refused(
+    ground_scan, system, cloud, other
+):
+    a = las(ground_scan / "a.las", system)
+    with pytest.raises(LidarError) as refused:
+        compare_surveys(a, ground_scan / "ground.tif", method="mesh")
+    assert cloud in str(refused.value) and f"ground.tif has {other}" in str(refused.value)
+    with pytest.raises(LidarError) as refused:
+        measure_coverage(ground_scan, a)
+    assert cloud in str(refused.value) and f"stations.yaml has {other}" in str(refused.value)
+
+
+@pytest.mark.parametrize("silent", [wkt(), UNKNOWN], ids=["wkt", "unknown"])
+def test_clouds_that_state_less_than_the_mesh_or_scene_are_noted(ground_scan, capsys, silent):
+    a = las(ground_scan / "a.las", silent)
+    found = compare_surveys(a, ground_scan / "ground.tif", method="mesh")
+    measure_coverage(ground_scan, a)
+    for notes in (found.figures["notes"], capsys.readouterr().out.splitlines()):
+        (note,) = (note for note in notes if "vertical datum" in note)
+        assert "a.las does not specify a vertical datum" in note
+        assert "assumed to be heights in the datum EGM96 geoid" in note
+
+
+def test_a_mesh_and_a_cloud_in_the_same_system_have_no_note(ground_scan):
+    a = las(ground_scan / "a.las", geotiff(5773))
+    found = compare_surveys(a, ground_scan / "ground.tif", method="mesh")
+    assert not [note for note in found.figures["notes"] if "specify" in note]
+
+
 # -- scenes ---------------------------------------------------------------------------------------
 
 
-def raster(path, crs, **options):
+def raster(path, crs, *, height_m=53.0, **options):
     place = from_origin(X0, Y0 + 20, 2, 2)
     size = {"width": 10, "height": 10, "count": 1, "dtype": "float32"}
     with rasterio.open(path, "w", crs=crs, transform=place, **size, **options) as file:
-        file.write(np.full((1, 10, 10), 53.0, np.float32))
+        file.write(np.full((1, 10, 10), height_m, np.float32))
 
 
 def city(path, system):

@@ -1,5 +1,6 @@
 """Wavelengths of sensors: unknown ones are noted where reflectances depend on them."""
 
+import numpy as np
 import pytest
 
 from lidarpool import Sensor, load_sensor
@@ -44,6 +45,26 @@ def test_spectra_at_an_unknown_wavelength_are_noted():
     assert "the spectrum 'leaf, green' is 0.47 at 905 nm and 0.26 at 1550 nm" in note
     (note,) = notes_of(LEAF, sensors={"a": UNKNOWN, "b": KNOWN, "c": "hesai/ot128"})
     assert "the wavelength of RIEGL VUX-1UAV and Hesai OT128 is unknown" in note
+
+
+def test_fog_at_an_unknown_wavelength_is_noted_and_dust_is_not():
+    fog = {"weather": {"visibility_km": 1.0}, "noise": {"detection_range_m": 90}}
+    (note,) = notes_of({"objects": "*", "reflectance": 0.4}, sensor=UNKNOWN, **fog)
+    assert "the wavelength of RIEGL VUX-1UAV is unknown and simulated as 905 nm, but" in note
+    # Kruse et al. (1962) with 3/km at 550 nm and an exponent of 0.585 · 1.306 ** (1/3)
+    expected = [
+        np.log(20) * (nm / 550) ** -(0.585 * (np.log(50) / np.log(20)) ** (1 / 3))
+        for nm in (905, 1550)
+    ]
+    near, far = expected
+    assert (
+        f"the extinction by fog depends on it: it is {near:.3g}/km at 905 nm and {far:.3g}/km"
+        in note
+    )
+    assert len(notes_of(LEAF, sensor=UNKNOWN, **fog)) == 2
+    assert notes_of(LEAF, sensor=KNOWN, **fog) == []
+    dust = {"weather": {"dust_mg_m3": 100.0}, "noise": {"detection_range_m": 90}}
+    assert notes_of({"objects": "*", "reflectance": 0.4}, sensor=UNKNOWN, **dust) == []
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from lidarsim.sensor.plain_data import from_plain_data, to_plain_data
 from lidarsim.sensor.ray_sensors import ListedSensor, PrismSensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.sampling import sample_survey
 
 COLUMNS = ("time", "range", "intensity", "azimuth", "elevation", "ray", "channel")
 ROOM = Scene.from_meshes([block("Room", (12, 9, 8))])
@@ -85,6 +86,19 @@ def test_exactly_the_pulses_in_blocked_directions_vanish(tmp_path, clockwise):
     assert blocked.sum() == 2 * (2 * 30 + 2 * 40 + 2 * 10 + 720)
     for name in found:
         np.testing.assert_array_equal(found[name], every[name][~blocked])
+
+
+def test_an_estimate_from_a_sample_omits_the_blocked_directions(tmp_path, monkeypatch):
+    """Each ray hits the room, and one in seven is cast."""
+    sensor = load_sensor(model_file(tmp_path, range_m=[0, 100]))
+    survey = Survey(sensor, poses=[(0.5, 0, 0)], steps=360)
+    monkeypatch.setattr("lidarsim.simulator.sampling.SAMPLE_RAYS", survey.ray_count // 7)
+    share = in_blocked(cast(without_blocked(sensor))).mean()
+    for one, returned in ((sensor, 1 - share), (without_blocked(sensor), 1.0)):
+        estimate = sample_survey(ROOM, replace(survey, sensor=one))
+        assert estimate["rays"] < survey.ray_count / 6
+        assert estimate["points"] == estimate["hits"]
+        assert estimate["hits"] == pytest.approx(returned * survey.ray_count, rel=0.02)
 
 
 def test_azimuths_within_a_firing_count(tmp_path):

@@ -272,6 +272,7 @@ def _show_coverage(
     The visible area is the area that can be seen from the stations of the scenario.
     """
     from ..comparing.compared_sweep import compared_in_world
+    from ..comparing.stated_frames import StatedFrame, check_same_systems
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
     from .terminal import Terminal
@@ -289,6 +290,12 @@ def _show_coverage(
         raise LidarError(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
+    heights = (str(system.vertical_datum or "") for system in prepared.findings.systems)
+    scene_frame = StatedFrame.from_epsg(
+        prepared.survey.epsg, f"the scene of {scenario.source}", next(filter(None, heights), "")
+    )
+    cloud_frame = StatedFrame.from_recording(recording, recording.name)
+    more = [*check_same_systems([cloud_frame, scene_frame]), *recording.omission_notes]
     positions = _station_positions(prepared)
     clouds = (compared_in_world(recording, number).points for number in range(recording.count))
     with terminal.status("finding points near the reachable surfaces"):
@@ -309,7 +316,7 @@ def _show_coverage(
     figures = _coverage_figures(coverage, prepared) | {
         "stations": len(positions),
         "within_m": within_m,
-        "notes": [*notes, *recording.omission_notes],
+        "notes": [*notes, *more],
     }
     head = (
         f"{figures['reachable_m2']:,.0f} m²{_target_phrase(targets)} are reachable from "
@@ -317,7 +324,7 @@ def _show_coverage(
         f"within {within_m:g} m of a point"
     )
     table = _object_lines(prepared.scene.names, coverage)
-    note_lines = map("note: {}".format, recording.omission_notes)
+    note_lines = map("note: {}".format, more)
     options.print_results(figures, chain([head], table, note_lines), as_json)
 
 

@@ -26,7 +26,9 @@ from lidarsim.environment.extras import reading
 from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import CutShortError, LidarError
 from lidarsim.numerics.arrays import Floats, Floats32
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
+from lidarsim.words import join_names
 
 from .cloud_format import CloudFormat
 from .flight_lines import FlightLines
@@ -49,6 +51,7 @@ _LAZ_CHUNK = 50_000
 _SYSTEM_POINTS = 5  # points at which the lengths in a coordinate system are checked
 ANGLE_DEG = 0.006  # step of the format's scan angle
 _MAX_INTENSITY = 65_535
+_MAX_CLASS = 255
 _FULL_SCALE = 2  # ID of lidarpool's record with the intensity that is stored as the maximum
 _MAX_RETURNS = 15  # largest return number in point formats 6 to 10
 _FORMAT_FIELDS = ("return_number", "returns")  # columns that are not stored in extra bytes
@@ -97,8 +100,8 @@ class LAS(CloudFormat):
     - Red, green and blue: the columns of these names, multiplied by 257.
     - Intensity: `intensity`, scaled so that `intensity_full_scale` is stored as 65,535. Greater
       intensities are clipped. A record of lidarpool contains the scale as JSON.
-    - Classification: `class` if it is below 256. The class lookup contains the names of these
-      classes, which are truncated to 15 ASCII characters.
+    - Classification: `class` if it is below 256, otherwise 0, and `survey_notes` mentions it. The
+      class lookup contains the names of these classes, which are truncated to 15 ASCII characters.
 
     All columns except return numbers, numbers of returns and colors are also stored in the extra
     bytes, without these limits. Fields whose values are unknown are 0. The coordinate system is
@@ -128,6 +131,19 @@ class LAS(CloudFormat):
     options = ("intensity_full_scale",)
     is_compressed: ClassVar[bool] = False
     for_scenes = True
+
+    @classmethod
+    def survey_notes(cls, survey: Survey) -> list[str]:
+        """Return a note about classes that do not fit into the classification."""
+        numbers = {material.semantic_class for material in survey.materials}
+        too_large = sorted(number for number in numbers if number > _MAX_CLASS)
+        if not too_large or not any(c.name == "class" for c in survey.stored_columns):
+            return []
+        return [
+            f"the classification in LAS files is at most {_MAX_CLASS}, so it is 0 for points of "
+            f"{'classes' if too_large[1:] else 'class'} {join_names([*map(str, too_large)])}. The "
+            "extra bytes `class` contain the true numbers"
+        ]
 
     def write(self, path: Path, spec: ExportSpec) -> float | None:
         """Write the file and return the intensity that is stored as 65,535."""
@@ -345,9 +361,8 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], sweeps: Swe
     if "time" in columns:
         record.gps_time = columns["time"] / 1e9 + _start_s(sweeps)
     if "class" in columns:
-        record.classification = np.where(columns["class"] < 256, columns["class"], 0).astype(
-            np.uint8
-        )
+        classes = columns["class"]
+        record.classification = np.where(classes <= _MAX_CLASS, classes, 0).astype(np.uint8)
     if {*COLORS} <= {*columns}:
         for name in COLORS:
             record[name] = columns[name].astype(np.uint16) * 257

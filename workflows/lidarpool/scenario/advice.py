@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.columns.table import VELOCITY
-from lidarsim.media.materials import FAR_NM, NEAR_NM, MaterialTable, reflectances
+from lidarsim.media.materials import FAR_NM, NEAR_NM, MaterialTable, extinction, reflectances
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.navigation import Gnss, Imu
@@ -328,7 +328,7 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
 
 
 def _assumed_wavelengths(prepared: PreparedScenario) -> Iterator[str]:
-    """Yield a note if reflectances depend on a wavelength that no source of a sensor states."""
+    """Yield notes about effects that depend on a wavelength that no source of a sensor states."""
     survey = prepared.survey
     sections = prepared.scenario.sensors.values() or (prepared.scenario.sensor,)
     models = dict.fromkeys(
@@ -336,18 +336,33 @@ def _assumed_wavelengths(prepared: PreparedScenario) -> Iterator[str]:
         for section, carried in zip(sections, survey.mounted_sensors, strict=True)
         if (section.model or section.calibration) and carried.sensor.optics.wavelength_nm is None
     )
+    if not models:
+        return
+    for effect in _effects_of_wavelength(survey):
+        yield (
+            f"the wavelength of {join_names([*models])} is unknown and simulated as {NEAR_NM:g} "
+            f"nm, but {effect}. If you know the wavelength, set `optics.wavelength_nm` in a copy "
+            "of the sensor file"
+        )
+
+
+def _effects_of_wavelength(survey: Survey) -> Iterator[str]:
+    """Describe effects of the survey that depend on the wavelength. Dust does not."""
     spectra = {entry.spectrum for entry in survey.materials if entry.spectrum is not None}
     shares = {name: reflectances()[name].shares for name in sorted(spectra)}
-    if not models or all(near == far for near, far in shares.values()):
-        return
-    name = max(shares, key=lambda name: abs(shares[name][0] - shares[name][1]))
-    near, far = shares[name]
-    yield (
-        f"the wavelength of {join_names([*models])} is unknown and simulated as {NEAR_NM:g} nm, "
-        f"but reflectances depend on it: the spectrum {name!r} is {near:.2f} at {NEAR_NM:g} nm and "
-        f"{far:.2f} at {FAR_NM:g} nm. If you know the wavelength, set `optics.wavelength_nm` in a "
-        "copy of the sensor file"
-    )
+    if any(near != far for near, far in shares.values()):
+        name = max(shares, key=lambda name: abs(shares[name][0] - shares[name][1]))
+        near, far = shares[name]
+        yield (
+            f"reflectances depend on it: the spectrum {name!r} is {near:.2f} at {NEAR_NM:g} nm and "
+            f"{far:.2f} at {FAR_NM:g} nm"
+        )
+    if survey.visibility_km is not None:
+        near, far = (1e3 * extinction(survey.visibility_km, nm) for nm in (NEAR_NM, FAR_NM))
+        yield (
+            f"the extinction by fog depends on it: it is {near:.3g}/km at {NEAR_NM:g} nm and "
+            f"{far:.3g}/km at {FAR_NM:g} nm"
+        )
 
 
 def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:

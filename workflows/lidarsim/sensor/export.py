@@ -230,6 +230,6 @@ def _missing_properties(sensor: Sensor, row: SensorFormat) -> list[str]:
         "divergence": sensor.optics.divergence_mrad is not None,
         "returns": sensor.returns is not None,
         "noise": sensor.noise is not None,
-        "blocked": len(sensor.beams.blocked) > 0,
+        "blocked": sensor.has_blocked_directions,
     }
     return [words for name, words in PROPERTIES.items() if has[name] and name not in row.holds]

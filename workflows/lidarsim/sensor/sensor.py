@@ -359,6 +359,11 @@ class Sensor:
             return None
         return self._rotate(firings, self.beams.origin)
 
+    @property
+    def has_blocked_directions(self) -> bool:
+        """Whether the platform blocks any directions."""
+        return len(self.beams.blocked) > 0
+
     def is_blocked(self, firings: Ints, channels: Ints) -> Bools:
         """Return whether the platform blocks pulses, which then have no return.
 

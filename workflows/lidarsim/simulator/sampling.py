@@ -11,7 +11,7 @@ import numpy as np
 from raybeam import available_backends
 
 from ..media.weather import Weather
-from ..numerics.arrays import Floats, Ints, Ints32
+from ..numerics.arrays import Bools, Floats, Ints, Ints32
 from ..numerics.even_samples import even_indices
 from ..scene.scene import Scene
 from ..schema.declared import declared_values
@@ -259,6 +259,16 @@ class _FewRays(Sensor):
         rays = self._rays(firings)
         origins = self.sampled.origins(rays.firings)
         return None if origins is None else origins[rays.row, rays.channel, None]
+
+    @property
+    def has_blocked_directions(self) -> bool:
+        """Whether the platform blocks any directions of the sampled sensor."""
+        return self.sampled.has_blocked_directions
+
+    def is_blocked(self, firings: Ints, channels: Ints) -> Bools:
+        """Return whether the platform blocks sampled rays."""
+        rays = self._rays(firings)
+        return self.sampled.is_blocked(rays.firings[rays.row], rays.channel)
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the start time, in nanoseconds, of each sampled ray's firing."""

@@ -249,8 +249,7 @@ def _compare_with_mesh(
 ) -> SurveyComparison:
     points, notes = a.sample(_MAX_COMPARED)
     chosen = {name: value for name, value in options.items() if value is not None}
-    placed = a.name, a.world_origin
-    found = mesh_deviations(points.positions, mesh, reach_m, placed, **chosen)
+    found = mesh_deviations(points.positions, mesh, reach_m, a.frame, a.world_origin, **chosen)
     found.figures["points"] = {"a": len(points)}
     return _summarize("mesh", [a], found, notes, str(mesh))
 
@@ -263,7 +262,7 @@ def _summarize(
     mesh: str | None = None,
 ) -> SurveyComparison:
     names = [cloud.name for cloud in clouds] + ([] if mesh is None else [mesh])
-    systems = [cloud.system_name for cloud in clouds if cloud.system_name]
+    systems = [name for cloud in clouds if (name := cloud.frame.system_name)]
     own = [note for cloud in clouds for note in cloud.notes]
     figures: dict[str, Any] = {
         "versions": {"lidarpool": __version__},

@@ -11,11 +11,12 @@ from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.files.mesh_formats import endings
-from lidarsim.scene.files.meshfile import load_meshes
+from lidarsim.scene.files.meshfile import Objects, load_objects
 from lidarsim.scene.scene_instances import SceneInstance
 
 from ...open3d_access.open3d_module import load_open3d
 from ..compared_sweep import bounds_of, origin_to_add
+from ..stated_frames import StatedFrame, check_same_systems
 from .deviations import Deviations, normal_columns
 
 _BATCH = 200_000
@@ -38,7 +39,8 @@ def mesh_deviations(
     points: Floats,
     mesh: Path,
     max_distance_m: float,
-    placed: tuple[str, Floats | None] = ("the points", None),
+    frame: StatedFrame | None = None,
+    world_origin: Floats | None = None,
     **options: Any,
 ) -> Deviations:
     """Return the signed distances from points to the nearest triangles of a mesh.
@@ -54,18 +56,26 @@ def mesh_deviations(
         Mesh file.
     max_distance_m
         Points farther than this from the mesh have no counterpart.
-    placed
-        Name of the points, and the world origin that they contain, if any. It is added to a mesh in
-        local coordinates.
+    frame
+        Frame that the file of the points states.
+    world_origin
+        World origin that the points contain, if any. It is added to a mesh in local coordinates.
     options
         `unit` and `up_axis` of the mesh.
+
+    Raises
+    ------
+    LidarError
+        If the mesh cannot be read, if its coordinate system or vertical datum differs from that of
+        the points, or if no point is within `max_distance_m`.
     """
     notes: list[str] = []
-    corners = _triangles(mesh, notes, options)
+    frame = frame or StatedFrame("the points")
+    corners = _triangles(mesh, frame, notes, options)
     boxes = bounds_of(points), bounds_of(corners.reshape(-1, 3))
-    if (shift := origin_to_add((placed[1], None), boxes)) is not None:
+    if (shift := origin_to_add((world_origin, None), boxes)) is not None:
         corners = corners + shift.origin
-        notes.append(shift.note((placed[0], str(mesh))))
+        notes.append(shift.note((frame.name, str(mesh))))
     origin = corners.reshape(-1, 3).mean(axis=0)
     is_closed = _is_closed(corners)
     surface = _Surface(corners - origin, is_closed)
@@ -97,9 +107,14 @@ def mesh_deviations(
     return Deviations(points[near], {"distance": distances[near]}, figures, tuple(notes), columns)
 
 
-def _triangles(path: Path, notes: list[str], options: dict[str, Any]) -> Floats:
-    """Return the corners of all triangles with nonzero area, in meters. Shape (f, 3, 3)."""
-    meshes = load_meshes(path, report=lambda text: notes.append(text.rstrip(".")), **options)
+def _triangles(path: Path, frame: StatedFrame, notes: list[str], options: dict[str, Any]) -> Floats:
+    """Return the corners of all triangles with nonzero area, in meters. Shape (f, 3, 3).
+
+    Raises LidarError if the file states a different frame.
+    """
+    objects = load_objects(path, report=lambda text: notes.append(text.rstrip(".")), **options)
+    notes += check_same_systems([frame, _frame_of(path, objects)])
+    meshes = objects.at_start(lambda text: notes.append(text.rstrip(".")))
     solid = [item.flat() if isinstance(item, SceneInstance) else item for item in meshes]
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in solid])
     edges = corners[:, 1:] - corners[:, :1]
@@ -107,6 +122,14 @@ def _triangles(path: Path, notes: list[str], options: dict[str, Any]) -> Floats:
     if not has_area.any():
         raise LidarError(f"{path} has no triangles with an area.")
     return corners[has_area]
+
+
+def _frame_of(path: Path, objects: Objects) -> StatedFrame:
+    """Return the frame that a mesh file or a raster states."""
+    raster = objects.raster
+    if raster is None or raster.epsg is not None or not raster.crs:
+        return StatedFrame.from_epsg(objects.epsg, str(path), objects.vertical_datum)
+    return StatedFrame(str(path), None, raster.crs, objects.vertical_datum)
 
 
 def _is_closed(corners: Floats) -> bool:

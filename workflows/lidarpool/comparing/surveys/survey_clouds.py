@@ -15,14 +15,13 @@ from lidarsim.errors import LidarError
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
-from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.schema.vocabulary import UNITS_M
 
 from ...clouds.recording import Recording, SeveralSensorsError
 from ...columns.parts import StoredCloud
 from ...recordings.opening import open_recording
 from ..compared_sweep import bounds_of, check_reach, origin_to_add, separation_m
+from ..stated_frames import StatedFrame, check_same_systems
 
 CloudSource = str | Path | Cloud | StoredCloud
 UNKNOWN = -1  # index of an unknown scanner
@@ -114,26 +113,9 @@ class SurveyCloud:
         return None if None in counts else sum(filter(None, counts))
 
     @cached_property
-    def epsg(self) -> int | None:
-        """EPSG code of the coordinate system, or None if the file does not state it."""
-        first = self.recordings[0]
-        return first.epsg if first.system is None else first.system.epsg
-
-    @cached_property
-    def system_name(self) -> str | None:
-        """Name of the coordinate system, or None if the file does not state it."""
-        if self.epsg is not None:
-            return f"EPSG:{self.epsg}"
-        system = self.recordings[0].system
-        return None if system is None else system.name
-
-    @cached_property
-    def vertical_datum(self) -> str:
-        """Name of the datum of heights, or an empty string if the file does not state it."""
-        system = self.recordings[0].system
-        if system is None:
-            return "" if self.epsg is None else StatedSystem(f"EPSG:{self.epsg}").vertical_datum
-        return system.vertical_datum
+    def frame(self) -> StatedFrame:
+        """Coordinate system and vertical datum that the file states."""
+        return StatedFrame.from_recording(self.recordings[0], self.name)
 
     @property
     def world_origin(self) -> Floats | None:
@@ -263,60 +245,16 @@ def check_same_frame(clouds: Sequence[SurveyCloud]) -> list[str]:
 
     Returns notes about clouds that do not specify a coordinate system although others do.
     """
+    notes = check_same_systems([cloud.frame for cloud in clouds])
     first, *others = clouds
     for other in others:
-        if first.system_name and other.system_name and not _is_same_system(first, other):
-            raise LidarError(
-                f"{first.name} has the coordinate system {first.system_name}, but {other.name} has "
-                f"{other.system_name}. Transform one of them first, for example with "
-                "filters.reprojection of PDAL."
-            )
         if first.unit_name != other.unit_name and not (first.unit or other.unit):
             raise LidarError(
                 f"{first.name} has the unit {first.unit_name}, but {other.name} has "
                 f"{other.unit_name}. Convert one of them first, or state the units with "
                 "`--unit-a` and `--unit-b` if their origins and axes are the same."
             )
-    stated = sorted({cloud.system_name for cloud in clouds if cloud.system_name})
-    notes = _height_notes(clouds)
-    if stated:
-        notes += [
-            f"{cloud.name} does not specify a coordinate system and is assumed to be in {stated[0]}"
-            for cloud in clouds
-            if cloud.system_name is None
-        ]
     return notes
-
-
-def _height_notes(clouds: Sequence[SurveyCloud]) -> list[str]:
-    """Return notes about clouds that do not specify a vertical datum although others do.
-
-    Raise LidarError if clouds state different vertical datums.
-    """
-    stated = [cloud for cloud in clouds if cloud.vertical_datum]
-    if not stated:
-        return []
-    first, *others = stated
-    heights = describe_heights(first.vertical_datum)
-    for other in others:
-        if not same_vertical_datum(first.vertical_datum, other.vertical_datum):
-            raise LidarError(
-                f"{first.name} has {heights}, but {other.name} has "
-                f"{describe_heights(other.vertical_datum)}. Transform one of them first, for "
-                "example with filters.reprojection of PDAL and a geoid grid."
-            )
-    return [
-        f"{cloud.name} does not specify a vertical datum, and its heights are assumed to be "
-        f"{heights}"
-        for cloud in clouds
-        if not cloud.vertical_datum
-    ]
-
-
-def _is_same_system(a: SurveyCloud, b: SurveyCloud) -> bool:
-    if a.epsg is not None and b.epsg is not None:
-        return a.epsg == b.epsg
-    return a.recordings[0].system == b.recordings[0].system or a.system_name == b.system_name
 
 
 def check_overlap(a: Floats, b: Floats, names: tuple[str, str], margin_m: float) -> None:

@@ -66,7 +66,7 @@ def ray_chunks(
 
 def _is_blocked(sensor: Sensor, specs: Sequence[ScanSpec], start: int, count: int) -> Bools:
     """Return whether the platform blocks each of `count` rays, starting with ray `start`."""
-    if not len(sensor.beams.blocked):
+    if not sensor.has_blocked_directions:
         return np.zeros(count, np.bool_)
     rays = np.arange(start, start + count, dtype=np.int64)
     firing, channel = np.divmod(rays, sensor.channels)

@@ -65,7 +65,7 @@ def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
 
 def _without_blocked(returns: PulseReturns, firings: Firings) -> PulseReturns:
     """Drop the returns of pulses that the platform blocks."""
-    if not len(firings.sensor.beams.blocked):
+    if not firings.sensor.has_blocked_directions:
         return returns
     number, channel = np.divmod(returns.ray, firings.sensor.channels)
     is_blocked = firings.sensor.is_blocked(firings.numbers[number], channel)
@@ -86,8 +86,9 @@ class LossStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether the sensor has blocked directions or faults that remove returns."""
-        blocked = setup.sensor.beams.blocked
-        return len(blocked) > 0 or bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
+        if setup.sensor.has_blocked_directions:
+            return True
+        return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Drop the lost returns of a batch."""
