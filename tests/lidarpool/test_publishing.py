@@ -165,3 +165,41 @@ def test_what_killed_writers_of_other_files_have_left_stays(tmp_path):
         (tmp_path / name).write_text("half")
     replace_file(tmp_path / "a.txt", b"whole")
     assert {path.name for path in tmp_path.iterdir()} == {"a.txt", *others}
+
+
+def publish_alone(target, text, *, is_folder):
+    with publishing.publishing(target) as staged:
+        new = staged / target.name
+        if is_folder:
+            new.mkdir()
+            (new / text).write_text(text)
+        else:
+            new.write_text(text)
+
+
+def content(target):
+    if target.is_file():
+        return target.read_text()
+    return [path.name for path in target.iterdir()]
+
+
+@pytest.mark.parametrize("was_folder", [True, False, None])
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_files_and_folders_replace_each_other(tmp_path, was_folder, is_folder):
+    target = tmp_path / "result"
+    if was_folder is not None:
+        publish_alone(target, "old", is_folder=was_folder)
+    publish_alone(target, "new", is_folder=is_folder)
+    assert content(target) == (["new"] if is_folder else "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+
+
+@pytest.mark.parametrize("was_folder", [True, False])
+def test_after_an_error_the_earlier_result_remains(tmp_path, was_folder):
+    target = tmp_path / "result"
+    publish_alone(target, "old", is_folder=was_folder)
+    with pytest.raises(RuntimeError), publishing.publishing(target) as staged:
+        (staged / "result").mkdir()
+        raise RuntimeError
+    assert content(target) == (["old"] if was_folder else "old")
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]

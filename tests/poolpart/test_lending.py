@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import defaultdict
 from itertools import product
 from types import SimpleNamespace
 
@@ -652,6 +653,19 @@ def test_only_tasks_that_have_waited_long_are_checked_and_once():
     lender._seceded = {"some"}
     lending.Lender._check_nested(lender)
     assert warned[3:] == ["again"]
+
+
+@pytest.mark.parametrize("runs", [True, False])
+@pytest.mark.parametrize("state", ["", "lent", "seceded", "returning"])
+def test_a_running_task_holds_its_slots_unless_it_has_lent_them(monkeypatch, runs, state):
+    monkeypatch.setattr(lending, "is_running", lambda worker, key: runs and worker == "worker")
+    lender = SimpleNamespace(
+        worker="worker",
+        _loans=defaultdict(int, task=1 if state == "lent" else 0, other=1),
+        _seceded={"task"} if state == "seceded" else {"another"},
+        _returning=[SimpleNamespace(key="task" if state == "returning" else "third")],
+    )
+    assert lending.Lender.holds_slots(lender, "task") == (runs and not state)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError, read_cloud
+from lidarpool.augmentation.augmented_sweep import AugmentedSweep
 from lidarpool.augmentation.conversion import open_converter
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.writing import ExportSpec
@@ -144,6 +145,23 @@ def test_parts_depend_on_their_sweep_only(written, tmp_path):
         rewrite(made, tmp_path / folder, tmp_path / f"{folder}w", changed, numbers)
     assert content(tmp_path / "aw") == content(tmp_path / "bw")
     assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_parts_state_their_channels_and_objects(written):
+    made = converter(written("kitti"), "las", "01")
+    augmented = changed(made.recording, 1)
+    _, details = made.encode(1, augmented)
+    returned = augmented.sweep.has_return
+    assert details["kept"] == returned.sum()
+    assert details["objects"] == augmented.sweep.columns["object"][returned].max() + 1 > 1
+    assert details["channels"] == 1, "the recording has no rings"
+    none = np.zeros(0, int)
+    empty = AugmentedSweep(augmented.sweep.select(none), none, none.astype(bool))
+    _, details = made.encode(1, empty)
+    assert (details["kept"], details["objects"], details["channels"]) == (0, 0, 1)
+    assert details["cells"] is None
+    _, details = made.encode(1, changed(made.recording, 1, two_boxes(70)))
+    assert details["objects"] == 72
 
 
 @pytest.mark.parametrize("name", ["kitti", "pcd", "nuscenes", "mcap"])
