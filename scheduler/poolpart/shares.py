@@ -68,6 +68,7 @@ CHECK_EVERY_S = 0.5  # interval between checks for tasks that run longer than ex
 MAX_COMPARED = 10  # number of workers that are compared for a task
 MAX_HOLDERS = 50  # number of copies of inputs that are considered for a task
 _UUID_LETTERS = 36
+_ALONE_S = 3600.0  # expected slot time of a task behind which no other tasks are assigned
 
 
 class _Bounds(NamedTuple):
@@ -276,6 +277,7 @@ class Shares(SchedulerPlugin):
         self.weights: dict[str, float] = {}
         self._clients: dict[Any, str] = {}  # {task key: name of its client}
         self._assigned_in: dict[Any, PartitionQueue] = {}  # {task key: queue of its partition}
+        self._isolated: set[Any] = set()  # keys of tasks that use all slots of their workers
         self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
         # {task with memory: worker to which it may be moved}
         self._moves: dict[Any, Any] = {}
@@ -350,6 +352,10 @@ class Shares(SchedulerPlugin):
                     name if submitter is None else self._clients.get(submitter.key, name)
                 )
 
+    def isolate(self, key: Any) -> None:
+        """Let a task use all slots of its worker from the next time on that it is assigned."""
+        self._isolated.add(key)
+
     def client_of_key(self, key: Any) -> str | None:
         """Return the client for which a task counts, or None if the task is unknown."""
         return self._clients.get(key)
@@ -395,6 +401,7 @@ class Shares(SchedulerPlugin):
                     queue.policy.remove_waiting(held.client)
         if finish == "forgotten":
             self._clients.pop(key, None)
+            self._isolated.discard(key)
 
     def _end(self, queue: PartitionQueue, key: Any, finish: str, report: Mapping[str, Any]) -> None:
         """Charge a client for the time that its task has run."""
@@ -437,6 +444,7 @@ class Shares(SchedulerPlugin):
     def restart(self, scheduler: Any) -> None:
         """Forget all tasks after `Client.restart`. Clients keep their weights."""
         self._assigned_in.clear()
+        self._isolated.clear()
         for name in [*self.queues]:
             self.add_partition(name)
         self._clients.clear()
@@ -502,6 +510,8 @@ class Shares(SchedulerPlugin):
         )
         is_tied = bool(task.worker_restrictions) or submitter_of(task) is not None
         seconds = slots * charge.expected_s
+        if task.key in self._isolated:
+            slots, seconds = worker.resources.get(queue.name, slots), _ALONE_S
         queue.assign(task.key, _Assignment(worker, slots, seconds, is_tied, memory_of(task)))
         self._assigned_in[task.key] = queue
         task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))

@@ -21,6 +21,11 @@ def until_cancelled(started, ended):
     Event(ended).set()
 
 
+def set_and_wait(started, release):
+    Event(started).set()
+    wait_for(release)
+
+
 def sleep_long(started):
     Event(started).set()
     time.sleep(3600)
@@ -121,20 +126,21 @@ def test_the_pipe_of_a_producer_whose_worker_is_restarted_fails(processes, make_
 def test_a_worker_with_another_task_or_result_is_not_restarted(processes, event, wait_until):
     io = Partition("IO", processes)
     names = [event(processes).name for _ in range(4)]
-    first = io.submit(until_cancelled, *names[:2])
+    first = io.submit(set_and_wait, *names[:2])
     assert Event(names[0], processes).wait(LONG_S)
     release = event(processes)
     reason = "running: worker IO-0 runs other tasks"
     other = io.submit(wait_for, release.name)
     wait_until(lambda: io.stats().running == 2)
     assert io.cancel(first, running="restart") == {first.key: reason}
+    Event(names[1], processes).set()
     release.set()
     assert other.result(LONG_S) is True  # this result is on no further worker
-    second = io.submit(until_cancelled, *names[2:])
+    second = io.submit(set_and_wait, *names[2:])
     assert Event(names[2], processes).wait(LONG_S)
     reason = "running: worker IO-0 holds the only copy of a result"
     assert io.cancel(second, running="restart") == {second.key: reason}
-    assert Event(names[3], processes).wait(LONG_S)
+    Event(names[3], processes).set()
     assert other.result(LONG_S) is True
     assert io.submit(get_name).result(LONG_S) == "IO-0"  # gets tasks again
 

@@ -1,5 +1,6 @@
 """Tasks do not wait behind others while a slot is free, and end if they take too long."""
 
+import ctypes
 import os
 import signal
 import time
@@ -135,3 +136,32 @@ def test_with_retries_it_runs_on_another_worker(nannies, monkeypatch):
     both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
     futures = [both.submit(hang_on, "1", timeout_s=0.5, retries=1) for _ in range(4)]
     assert nannies.gather(futures) == ["0"] * 4
+
+
+def hold_interpreter(path):
+    """Hold the interpreter lock until the process is killed."""
+    with path.open("a") as file:
+        file.write("held\n")
+    ctypes.PyDLL(None).sleep(3600)
+
+
+def sleep_for(seconds):
+    time.sleep(seconds)
+    return seconds
+
+
+@pytest.mark.extended
+def test_only_the_task_that_blocks_its_worker_fails(nannies, monkeypatch, tmp_path):
+    """The scheduler cannot know which task holds the interpreter lock, so all of them run again."""
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 1.0)
+    monkeypatch.setattr("poolpart.extras.watching.SILENT_S", 3.0)
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=2)
+    limit = {"timeout_s": 1.0}
+    others = [both.submit(sleep_for, 0.8, **limit) for _ in range(3)]
+    blocker = both.submit(hold_interpreter, tmp_path / "held", **limit)
+    others += [both.submit(sleep_for, 0.8, **limit) for _ in range(3)]
+    with pytest.raises(TaskTimeoutError):
+        blocker.result(LONG_S)
+    assert nannies.gather(others) == [0.8] * 6
+    assert len((tmp_path / "held").read_text().split()) <= 4

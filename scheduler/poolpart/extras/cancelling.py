@@ -32,7 +32,7 @@ from ..internals.scheduler import (
     running_candidates,
     stop_assigning,
 )
-from ..internals.worker import current_task, running_keys
+from ..internals.worker import current_task, running_times
 from ..pipe_states import fail_pipes_of_killed_task
 from ..workers import run_on_scheduler
 
@@ -117,9 +117,9 @@ async def _cancel_tasks(
     cancel_keys(scheduler, keys, client_id)
     kept = [key for key in known if key in scheduler.tasks]
     outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
-    loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
+    loads = await asyncio.gather(*(request_load(scheduler, worker) for worker in members))
 
-    async def end(worker: Any, load: _Load | None) -> None:
+    async def end(worker: Any, load: Load | None) -> None:
         # A canceled task may prevent its worker from responding.
         running = candidates[worker] if load is None else load.running
         found = [key for key in running if key in keys and key not in kept]
@@ -146,6 +146,7 @@ async def free_worker(
     candidates: Set[Any],
     *,
     recompute: bool = False,
+    recompute_if_silent: bool = False,
     patience_s: float = 0.0,
 ) -> str:
     """Restart a worker to free the slots of tasks that do not end, and return the outcome.
@@ -160,11 +161,14 @@ async def free_worker(
     name
         Partition of the worker.
     ended
-        Keys of the tasks, which have already ended for the scheduler.
+        Keys of the tasks, which have already ended for the scheduler. The set may grow during the
+        call.
     candidates
         Keys of all tasks that the worker may have been running, if it does not respond.
     recompute
         Whether other running tasks and results that cannot be copied may be computed again.
+    recompute_if_silent
+        The same, but only if the worker does not respond.
     patience_s
         Time in seconds to wait until other running tasks have finished.
     """
@@ -172,15 +176,21 @@ async def free_worker(
     if worker.status is not Status.running:
         return f"{running} is {worker.status.name}"
     stop_assigning(scheduler, worker)
-    load = await _hand_over(scheduler, worker, name, candidates)
-    deadline = time.monotonic() + patience_s
-    while load is not None and ended < {*load.running} and time.monotonic() < deadline:
-        await asyncio.sleep(_CHECK_S)
-        load = await _load(scheduler, worker)
-    if load is not None and ended.isdisjoint(load.running):
+    try:
+        load = await _hand_over(scheduler, worker, name, candidates)
+        deadline = time.monotonic() + patience_s
+        while load is not None and ended < load.running.keys() and time.monotonic() < deadline:
+            await asyncio.sleep(_CHECK_S)
+            load = await request_load(scheduler, worker)
+        if load is not None and ended.isdisjoint(load.running):
+            resume_assigning(scheduler, worker)
+            return "ended"
+        recompute = recompute or (recompute_if_silent and load is None)
+        obstacle = await _obstacle(scheduler, worker, name, load, ended, candidates, recompute)
+    except Exception:
         resume_assigning(scheduler, worker)
-        return "ended"
-    if obstacle := await _obstacle(scheduler, worker, name, load, ended, candidates, recompute):
+        raise
+    if obstacle:
         if load is None:
             _start(_resume_when_responding(scheduler, worker))
         else:
@@ -197,7 +207,7 @@ async def await_end(scheduler: Any, worker: Any, key: Any, seconds: float) -> bo
     """Wait until a worker no longer runs a task, and return whether this was within the time."""
     deadline = time.monotonic() + seconds
     while scheduler.workers.get(worker.address) is worker:
-        load = await _load(scheduler, worker)
+        load = await request_load(scheduler, worker)
         if load is not None and key not in load.running:
             return True
         if time.monotonic() > deadline:
@@ -206,9 +216,9 @@ async def await_end(scheduler: Any, worker: Any, key: Any, seconds: float) -> bo
     return True
 
 
-async def _hand_over(scheduler: Any, worker: Any, name: str, candidates: Set[Any]) -> _Load | None:
+async def _hand_over(scheduler: Any, worker: Any, name: str, candidates: Set[Any]) -> Load | None:
     """Move a worker's waiting tasks to other workers, and return its load afterwards."""
-    load = await _load(scheduler, worker)
+    load = await request_load(scheduler, worker)
     if load is None:
         waiting = [task for task in worker.processing if task.key not in candidates]
         reschedule_tasks(scheduler, [task for task in waiting if not is_bound(task)])
@@ -219,14 +229,14 @@ async def _hand_over(scheduler: Any, worker: Any, name: str, candidates: Set[Any
         task.key not in load.running and not is_bound(task) for task in worker.processing
     ):
         await asyncio.sleep(0.01)
-    return await _load(scheduler, worker)
+    return await request_load(scheduler, worker)
 
 
 async def _obstacle(
     scheduler: Any,
     worker: Any,
     name: str,
-    load: _Load | None,
+    load: Load | None,
     ended: Set[Any],
     candidates: Set[Any],
     recompute: bool,
@@ -234,7 +244,7 @@ async def _obstacle(
     """Return why a worker must not be restarted, or "". Results are copied to other workers."""
     silent = " does not respond" if load is None else ""
     joined = f"{silent} and" if silent else ""
-    running = candidates if load is None else {*load.running}
+    running = candidates if load is None else load.running.keys()
     if not worker.nanny:
         return f"{joined} has no nanny to restart it"
     if running - ended and not recompute:
@@ -258,7 +268,7 @@ async def _obstacle(
 async def _resume_when_responding(scheduler: Any, worker: Any) -> None:
     """Assign tasks to a worker again as soon as it responds."""
     while scheduler.workers.get(worker.address) is worker:
-        if await _load(scheduler, worker) is not None:
+        if await request_load(scheduler, worker) is not None:
             resume_assigning(scheduler, worker)
             return
         await asyncio.sleep(_CHECK_S)
@@ -274,14 +284,15 @@ def _start(coroutine: Coroutine[Any, Any, None]) -> None:
     task.add_done_callback(_background.discard)
 
 
-class _Load(NamedTuple):
+class Load(NamedTuple):
     """Tasks and results that a worker reports about itself."""
 
-    running: list[Any]  # keys of running tasks, including those that the scheduler has forgotten
+    # {key: seconds for which the task has run}, including tasks that the scheduler has forgotten
+    running: dict[Any, float]
     holds_results: bool  # whether the worker holds bytes that a client has not fetched yet
 
 
-async def _load(scheduler: Any, worker: Any) -> _Load | None:
+async def request_load(scheduler: Any, worker: Any) -> Load | None:
     """Request the load of a worker. Return None if the worker does not respond."""
     try:
         return await _await_for(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
@@ -301,5 +312,5 @@ async def _await_for(request: Coroutine[Any, Any, T], seconds: float) -> T | Non
     return None
 
 
-def _load_here(dask_worker: Any = None) -> _Load:
-    return _Load(running_keys(dask_worker), holds_bytes())
+def _load_here(dask_worker: Any = None) -> Load:
+    return Load(running_times(dask_worker), holds_bytes())

@@ -10,7 +10,10 @@ A task that runs longer than its `timeout_s` fails. Dask does not stop its funct
 is restarted if the function does not return (see `cancelling.free_worker`).
 
 The scheduler learns from heartbeats which tasks a worker runs, and since when. Workers in a small
-cluster send two heartbeats per second.
+cluster send two heartbeats per second. If they are late, the scheduler asks the worker. A worker
+that does not respond may be blocked by any of its tasks, and may have finished others without being
+able to report it. It is restarted, and the tasks that it may have been running run again, each on a
+worker of its own. Only a task that is alone on its worker is known to block it, and fails.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ import asyncio
 import heapq
 import logging
 import time
-from collections.abc import Iterable, Set
+from collections import Counter
+from collections.abc import Coroutine, Iterable, Set
+from functools import partial
 from typing import Any
 
 from ..errors import TaskTimeoutError
@@ -36,7 +41,8 @@ from ..internals.scheduler import (
 )
 from ..limits import TIMEOUT
 from ..pipe_states import fail_pipes_of_killed_task
-from .cancelling import ANSWER_S, await_end, free_worker
+from ..shares import NAME as SHARES
+from .cancelling import ANSWER_S, await_end, free_worker, request_load
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +50,11 @@ WATCH_S = 0.5  # interval between checks
 LATE_S = 0.9  # time after which a task that waits on a worker is moved to a free slot
 SILENT_S = 5.0  # time without a heartbeat after which a worker is assumed to be blocked by a task
 PATIENCE_S = 60.0  # time for other tasks to finish before a hung worker is restarted
+RETRY_S = 15.0  # interval between attempts to restart a hung worker
+MOST_BLOCKED = 3  # a task fails if it may have blocked more workers, even if it was not alone
+
+
+_ENDED = "memory", "erred", "released", "forgotten"  # states of tasks
 
 
 class TaskWatch:
@@ -56,6 +67,9 @@ class TaskWatch:
         self._waiting: dict[Any, tuple[Any, float]] = {}
         self._tried: dict[Any, set[Any]] = {}  # {waiting task: workers on which it has waited}
         self._ending: set[tuple[Any, Any]] = set()  # (worker, key) of tasks beyond their limit
+        self._failed: dict[Any, set[Any]] = {}  # {worker: keys of these tasks that have not ended}
+        self._asked: set[Any] = set()  # workers that are being asked which tasks they run
+        self._blocked: Counter[Any] = Counter()  # {task: workers that it may have blocked}
         self._requests: set[asyncio.Task[None]] = set()
         self._loop = asyncio.ensure_future(self._run())
 
@@ -93,6 +107,8 @@ class TaskWatch:
             if usable:
                 self._move_late_tasks(name, members, usable, waiting)
         self._tried = {task: at for task, at in self._tried.items() if task in self._waiting}
+        for task in [task for task in self._blocked if task.state in _ENDED]:
+            del self._blocked[task]
 
     # -- waiting tasks -----------------------------------------------------------------
 
@@ -154,58 +170,155 @@ class TaskWatch:
     def _end_late_tasks(self, name: str, members: Iterable[Any]) -> None:
         """Let tasks fail that have been running longer than their limit."""
         for worker in members:
-            silent_s = time.time() - worker.last_seen
             for task, seconds in list(worker.executing.items()):
-                self._check_limit(name, worker, task, seconds + silent_s)
-            if silent_s > SILENT_S:  # a task may have started after the last heartbeat
-                for task in running_candidates(worker) - worker.executing.keys():
-                    self._check_limit(name, worker, task, silent_s - SILENT_S)
+                if self._is_late(name, worker, task, seconds):
+                    self._end_soon(name, worker, task, seconds)
+            if worker not in self._asked and self._possibly_late(name, worker):
+                self._asked.add(worker)
+                request = self._start(self._ask(name, worker))
+                request.add_done_callback(partial(self._forget_question, worker))
 
-    def _check_limit(self, name: str, worker: Any, task: Any, seconds: float) -> None:
+    def _possibly_late(self, name: str, worker: Any) -> dict[Any, float]:
+        """Return tasks that may be late if nothing has changed since the last heartbeat.
+
+        The result maps each task to the number of seconds for which it may have been running.
+        """
+        silent_s = time.time() - worker.last_seen
+        running = {task: seconds + silent_s for task, seconds in worker.executing.items()}
+        if silent_s > SILENT_S:  # a task may have started after the last heartbeat
+            for task in running_candidates(worker) - running.keys():
+                running[task] = silent_s - SILENT_S
+        return {t: s for t, s in running.items() if self._is_late(name, worker, t, s)}
+
+    def _is_late(self, name: str, worker: Any, task: Any, seconds: float) -> bool:
         limit_s = (task.annotations or {}).get(TIMEOUT)
-        if limit_s is None or seconds <= limit_s or task.processing_on is not worker:
+        return (
+            limit_s is not None
+            and seconds > limit_s
+            and task.processing_on is worker
+            and (worker, task.key) not in self._ending
+            and bool(slots_of(task, name))
+        )
+
+    def _forget_question(self, worker: Any, _: object) -> None:
+        self._asked.discard(worker)
+
+    async def _ask(self, name: str, worker: Any) -> None:
+        """Ask a worker whether tasks are late that may be according to its last heartbeat."""
+        load = await request_load(self.scheduler, worker)
+        if load is None:
+            await self._free_blocked(name, worker)
             return
-        if (worker, task.key) in self._ending or not slots_of(task, name):
-            return
+        for key, seconds in load.running.items():
+            task = self.scheduler.tasks.get(key)
+            if task is not None and self._is_late(name, worker, task, seconds):
+                self._end_soon(name, worker, task, seconds)
+
+    async def _free_blocked(self, name: str, worker: Any) -> None:
+        """Restart a worker that does not respond, and let a task fail if it is the only cause."""
+        late = self._possibly_late(name, worker)
+        candidates = running_candidates(worker)
+        reported = [task for task in late if task in worker.executing or task in self._blocked]
+        is_alone = len(worker.processing) == 1
+        causes = [t for t in reported if is_alone or self._blocked[t] >= MOST_BLOCKED]
+        if causes:
+            for task in causes:
+                self._end_soon(name, worker, task, late[task])
+        elif late:
+            shares = self.scheduler.plugins.get(SHARES)
+            for task in candidates:
+                if shares is not None:
+                    shares.isolate(task.key)
+            keys = {task.key for task in candidates}
+            outcome = await self._free(name, worker, set(), keys)
+            if outcome.startswith("restarted") or not worker.nanny:
+                self._blocked.update(candidates)
+                logger.warning("One of the tasks %s blocks its worker (%s).", keys, outcome)
+
+    def _end_soon(self, name: str, worker: Any, task: Any, seconds: float) -> None:
+        limit_s = task.annotations[TIMEOUT]
         error = TaskTimeoutError(
             f"Task {task.key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
             f"{limit_s:g} s (`timeout_s`)."
         )
         ending = worker, task.key
         self._ending.add(ending)
-        request = asyncio.ensure_future(self._end(name, worker, task, error))
-        self._requests.add(request)
-        request.add_done_callback(self._requests.discard)
+        request = self._start(self._end(name, worker, task, error))
         request.add_done_callback(lambda _: self._ending.discard(ending))
 
     async def _end(self, name: str, worker: Any, task: Any, error: TaskTimeoutError) -> None:
         """Let a task fail, and restart its worker if the function does not return."""
         key = task.key
-        annotations = task.annotations
-        candidates = {candidate.key for candidate in running_candidates(worker)}
+        failed = self._failed.setdefault(worker, set())
+        failed.add(key)
+        try:
+            has_ended = await self._fail(worker, task, error)
+            if not has_ended:
+                await self._end_function(name, worker, key, task.annotations, error)
+        finally:
+            failed.discard(key)
+            if not failed:
+                self._failed.pop(worker, None)
+
+    async def _fail(self, worker: Any, task: Any, error: TaskTimeoutError) -> bool:
+        """Let a task fail, and return whether its function has returned soon afterwards."""
+        key = task.key
         was_running = worker in self.scheduler.running  # rather than paused
         is_silent = time.time() - worker.last_seen > SILENT_S
-        if is_silent and len(worker.processing) > 1 and not task.suspicious:
-            # Another task may be running, if the report that this one has finished is delayed.
-            # Therefore, the task fails only if this happens again.
-            task.suspicious += 1
-            await free_worker(self.scheduler, worker, name, candidates, candidates)
-            return
         if was_running:
             stop_assigning(self.scheduler, worker)  # a further run starts elsewhere
-        fail_task(self.scheduler, task, worker.address, error)
-        if was_running and not is_silent:
-            resume_assigning(self.scheduler, worker)
-        has_ended = await await_end(self.scheduler, worker, key, ANSWER_S)
-        if was_running and is_silent:
-            resume_assigning(self.scheduler, worker)
-        if not has_ended:
-            outcome = await free_worker(
-                self.scheduler, worker, name, {key}, candidates, patience_s=PATIENCE_S
-            )
-            logger.warning("%s Its function did not return (%s).", error, outcome)
+        try:
+            fail_task(self.scheduler, task, worker.address, error)
+            if is_silent:  # other tasks would wait for it
+                return await await_end(self.scheduler, worker, key, ANSWER_S)
+        finally:
+            if was_running:
+                resume_assigning(self.scheduler, worker)
+        return await await_end(self.scheduler, worker, key, ANSWER_S)
+
+    async def _end_function(
+        self, name: str, worker: Any, key: Any, annotations: Any, error: TaskTimeoutError
+    ) -> None:
+        """Restart a worker whose function has not returned, as soon as this is possible."""
+        earlier = ""
+        has_ended = False
+        while not has_ended:
+            candidates = {candidate.key for candidate in running_candidates(worker)} | {key}
+            patience_s = 0.0 if earlier else PATIENCE_S
+            outcome = await self._free(name, worker, self._failed[worker], candidates, patience_s)
+            if outcome != earlier:
+                logger.warning("%s Its function did not return (%s).", error, outcome)
+            earlier = outcome
             if outcome.startswith("restarted"):
                 fail_pipes_of_killed_task(self.scheduler, key, annotations)
+                return
+            has_ended = await await_end(self.scheduler, worker, key, RETRY_S)
+
+    async def _free(
+        self,
+        name: str,
+        worker: Any,
+        ended: set[Any],
+        candidates: set[Any],
+        patience_s: float = 0.0,
+    ) -> str:
+        """Restart a worker unless data would be lost that another task cannot compute again."""
+        return await free_worker(
+            self.scheduler,
+            worker,
+            name,
+            ended,
+            candidates,
+            recompute_if_silent=True,
+            patience_s=patience_s,
+        )
+
+    def _start(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run a coroutine until it ends or the scheduler closes."""
+        request = asyncio.ensure_future(coroutine)
+        self._requests.add(request)
+        request.add_done_callback(self._requests.discard)
+        return request
 
 
 def slots_of(task: Any, name: str) -> float:

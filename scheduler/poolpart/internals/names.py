@@ -393,6 +393,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_WORKER}.actors",
             f"{_SCHEDULER_WORKER}.nanny",
             f"{_WORKER_STATE}.all_running_tasks",
+            f"{_WORKER_TASK}.start_time",
             f"{_WORKER_TASK}.state",
         ),
         "restart a worker that only runs canceled tasks",
@@ -460,11 +461,14 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_WORKER}.last_seen",
             f"{_SCHEDULER_WORKER}.processing",
             f"{_SCHEDULER_WORKER}.used_resources",
+            f"{_WORKER_STATE}.all_running_tasks",
+            f"{_WORKER_TASK}.start_time",
         ),
         "move tasks that wait behind others, and end tasks that run too long",
         (
             "test_watching.py::test_tasks_do_not_wait_while_another_slot_is_free",
             "test_watching.py::test_a_task_that_takes_too_long_fails",
+            "test_watching.py::test_only_the_task_that_blocks_its_worker_fails",
         ),
     ),
 )

@@ -14,9 +14,10 @@ def has_running_tasks(dask_worker: Any = None) -> bool:
     return bool(dask_worker.state.all_running_tasks)
 
 
-def running_keys(worker: Any) -> list[Any]:
-    """Return the keys of all tasks that a worker runs, including canceled tasks."""
-    return [task.key for task in worker.state.all_running_tasks]
+def running_times(worker: Any) -> dict[Any, float]:
+    """Return for how many seconds a worker has run each of its tasks, including canceled tasks."""
+    now = time.time()
+    return {task.key: now - (task.start_time or now) for task in worker.state.all_running_tasks}
 
 
 # -- declared resources ------------------------------------------------------------------
