@@ -21,7 +21,6 @@ import yaml
 from PIL import Image
 
 from lidarsim.errors import explain_os_errors
-from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
@@ -113,7 +112,7 @@ def insert_picture(page: Path, name: str, picture: str) -> None:
     pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
     with explain_os_errors(f"{page} cannot be written"):
         text = pattern.sub(lambda match: f"{match[1]}>{picture}", page.read_text(encoding="utf-8"))
-        Storage.at(page.parent, durable=False).write(page.name, text.encode())
+        page.write_text(text, encoding="utf-8")
 
 
 # A station in the top view: x and y in pixels from the northwest corner, and its number.
