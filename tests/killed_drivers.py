@@ -31,6 +31,7 @@ CALLS = {
     "GROW": (CloudWriter, "append"),
     "SAVE": (CloudWriter, "finish"),
     "PUT": (Storage, "put"),
+    "COPY": (Storage, "copy_from"),
     "REMOVE": (RunStore, "remove"),
 }
 

@@ -128,7 +128,7 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     assert again.code == 2 and f"{url}/pcd already exists. Pass another folder" in again.err
 
     Storage.at(url).remove(["report.json"])
-    for command in (["plot"], ["export", "--format", "pcd"], ["view"]):
+    for command in (["plot"], ["export", "--format", "pcd", "--overwrite"], ["view"]):
         half = lidarpool(*command, url)
         assert half.code == 2 and f"{url} does not contain a complete result" in half.err
 
@@ -278,7 +278,8 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     often += "r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0\n"
     run = ["s.yaml", "--out", url, "--resume", "--scheduler", cluster]
     moments = [("COMMIT", 1), ("driver.frame", 100), ("COMMIT", 4), ("OPEN", 1), ("SAVE", 1)]
-    assert drive(here, [*moments, ("PUT", 3)], *run, prelude=often) == [-9] * 6
+    moments += [("PUT", 1), ("COPY", 2)]
+    assert drive(here, moments, *run, prelude=often) == [-9] * 7
     assert "report.json" not in Storage.at(url).sizes()
     assert drive(here, [("REMOVE", 1), ("", 1)], *run, prelude=often) == [-9, 0]
     out = Storage.at(url)
