@@ -547,6 +547,25 @@ def test_a_missing_file_of_a_table_is_named_with_its_line(campaign, folder):
     assert where in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("base", "hint"),
+    [
+        ("sensor: {layers: 8}\n", "'mount.position.2'"),
+        ("sensors: {roof: {layers: 8}}\n", "'sensors.roof.mount.position.2'"),
+    ],
+    ids=["one sensor", "several"],
+)
+def test_the_whole_path_of_a_mount_is_suggested(tmp_path, base, hint):
+    (tmp_path / "base.yaml").write_text(f"scene: seed\nposes: [[0, 0, 2]]\n{base}")
+    vary = {"sensor.mount.position.2": {"uniform": [1, 2]}}
+    (tmp_path / "c.yaml").write_text(
+        yaml.safe_dump({"base": "base.yaml", "count": 2, "vary": vary})
+    )
+    with pytest.raises(LidarError) as raised:
+        Campaign.load(tmp_path / "c.yaml").check_files()
+    assert f"'mount' is not a field of sensor. Did you mean {hint}?" in str(raised.value)
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_it_is_told_what_is_wrong(campaign, name):
     vary, says = WRONG[name]

@@ -841,3 +841,31 @@ def test_options_of_another_kind_of_comparison_are_refused(arguments, says):
     done = invoke(*arguments)
     assert done.exit_code == 2
     assert says in " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("method", ["planes", "mesh"])
+def test_the_progress_continues_after_the_clouds_are_read(tmp_path, monkeypatch, method):
+    """Three batches of points, and for planes as many of reference points."""
+    monkeypatch.setattr(f"lidarpool.comparing.surveys.{method}._BATCH", 300)
+    x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))
+    plane = np.stack([x.ravel(), y.ravel(), np.zeros(900)], axis=1)
+    b = Cloud(plane, {})
+    if method == "mesh":
+        b = tmp_path / "b.obj"
+        b.write_text("v 0 0 0\nv 29 0 0\nv 29 29 0\nv 0 29 0\nf 1 2 3\nf 1 3 4\n")
+    shown = []
+    found = compare_surveys(
+        Cloud(plane + np.array([0, 0, 0.02]), {}),
+        b,
+        method=method,
+        radius_m=None if method == "mesh" else 2.5,
+        on_progress=lambda *row: shown.append(row),
+    )
+    distance = found.figures["components"]["distance"]
+    assert distance["mean_m"] == pytest.approx(0.02, abs=1e-6)
+    what = "measuring distances" if method == "mesh" else "fitting planes"
+    rows = [row for row in shown if not row[0].startswith("reading")]
+    assert rows[-3:] == [(what, done, 900, "points") for done in (300, 600, 900)]
+    surfaces = [row for row in rows if row[0] == "finding surfaces"]
+    assert bool(surfaces) == (method == "planes")
+    assert all(row[1] <= row[2] and row[3] == "planes" for row in surfaces)

@@ -46,7 +46,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
         if is_section(type(node)):
-            key, node, kind = _find_in_section(scenario, node, remaining[0], path)
+            key, node, kind = _find_in_section(scenario, node, remaining, path)
             part_count = 1
         elif isinstance(node, dict):
             keys = {str(key): key for key in node}  # the keys of `classes` are integers
@@ -66,13 +66,14 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
 
 
 def _find_in_section(
-    scenario: Scenario, node: BaseModel, name: str, path: str
+    scenario: Scenario, node: BaseModel, remaining: Sequence[str], path: str
 ) -> tuple[str, Any, Any]:
     """Return the name, value and annotation of a field.
 
-    `node` is the section at `path`, and `name` is the name of the field in YAML. Raise LidarError
-    if there is no such field.
+    `node` is the section at `path`. The first of the `remaining` parts of a path is the name of the
+    field in YAML. Raise LidarError if there is no such field.
     """
+    name, *inner = remaining
     section = type(node)
     fields = fields_of(section)
     attributes = {field.alias or attribute: attribute for attribute, field in fields.items()}
@@ -80,7 +81,7 @@ def _find_in_section(
         return name, None, further[name].annotation
     if name not in attributes:
         kind = f"a field of {path}" if path else "a section of a scenario"
-        hint = did_you_mean(name, attributes) or _path_hint(scenario, name)
+        hint = did_you_mean(name, attributes) or _path_hint(scenario, name, inner)
         if name.isdecimal() and "position" in attributes:  # the pose is in the short form [x, y, z]
             hint = f" Did you mean {f'{path}.position.{name}'!r}?"
         raise LidarError(f"{name!r} is not {kind}.{hint}")
@@ -88,18 +89,24 @@ def _find_in_section(
     return name, getattr(node, attribute, None), fields[attribute].annotation
 
 
-def _path_hint(scenario: Scenario, name: str) -> str:
+def _path_hint(scenario: Scenario, name: str, inner: Sequence[str]) -> str:
     """Return a hint with the paths of all fields that have the given name, or an empty string.
 
-    For example, return " Did you mean 'sensor.performance'?".
+    `inner` contains the parts of the path that follow the name. For example, return " Did you mean
+    'mount.position.2'?" for the name "mount".
     """
-    for owners in owners_by_level(name, owner_of_file(Scenario)):
-        paths = [path for owner in owners if (path := _path_in(scenario, owner.names, name))]
-        # Prefer sections that are set, because a scenario has either `sensor` or `sensors`.
-        given = [path for path in paths if path.split(".")[0] in scenario.model_fields_set]
-        if paths:
-            return f" Did you mean {' or '.join(map(repr, (given or paths)[:3]))}?"
-    return ""
+    levels = [
+        [path for owner in owners if (path := _path_in(scenario, owner.names, name))]
+        for owners in owners_by_level(name, owner_of_file(Scenario))
+    ]
+    # Prefer sections that are set, because a scenario has either `sensor` or `sensors`.
+    fields_set = scenario.model_fields_set
+    given = [[path for path in paths if path.split(".")[0] in fields_set] for paths in levels]
+    shown = next(filter(None, [*given, *levels]), [])
+    if not shown:
+        return ""
+    texts = [repr(".".join([path, *inner])) for path in shown[:3]]
+    return f" Did you mean {' or '.join(texts)}?"
 
 
 def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:

@@ -236,8 +236,10 @@ def _distances(
     check_overlap(points.positions, reference.positions, (a.name, b.name), reach_m)
     if radius_m is None:
         radius_m = neighborhood_radius(reference.positions)
-    compute = m3c2_deviations if method == "m3c2" else plane_deviations
-    found = compute(points, reference, radius_m, reach_m)
+    if method == "m3c2":
+        found = m3c2_deviations(points, reference, radius_m, reach_m)
+    else:
+        found = plane_deviations(points, reference, radius_m, reach_m, a.show)
     found.figures["points"] = {"a": len(points), "b": len(reference)}
     has_scanners = points.has_scanners or reference.has_scanners
     found.figures["positive_side"] = "scanners" if has_scanners else "surfaces"
@@ -249,7 +251,9 @@ def _compare_with_mesh(
 ) -> SurveyComparison:
     points, notes = a.sample(_MAX_COMPARED)
     chosen = {name: value for name, value in options.items() if value is not None}
-    found = mesh_deviations(points.positions, mesh, reach_m, a.frame, a.world_origin, **chosen)
+    found = mesh_deviations(
+        points.positions, mesh, reach_m, a.frame, a.world_origin, a.show, **chosen
+    )
     found.figures["points"] = {"a": len(points)}
     return _summarize("mesh", [a], found, notes, str(mesh))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
+from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.scene.files.meshfile import Objects, load_objects
@@ -41,6 +42,7 @@ def mesh_deviations(
     max_distance_m: float,
     frame: StatedFrame | None = None,
     world_origin: Floats | None = None,
+    show: WritingProgress = lambda *_: None,
     **options: Any,
 ) -> Deviations:
     """Return the signed distances from points to the nearest triangles of a mesh.
@@ -60,6 +62,8 @@ def mesh_deviations(
         Frame that the file of the points states.
     world_origin
         World origin that the points contain, if any. It is added to a mesh in local coordinates.
+    show
+        Called when the distances of a part of the points have been measured.
     options
         `unit` and `up_axis` of the mesh.
 
@@ -79,10 +83,10 @@ def mesh_deviations(
     origin = corners.reshape(-1, 3).mean(axis=0)
     is_closed = _is_closed(corners)
     surface = _Surface(corners - origin, is_closed)
-    batches = [
-        surface.signed_distances(points[start : start + _BATCH] - origin)
-        for start in range(0, len(points), _BATCH)
-    ]
+    batches = []
+    for start in range(0, len(points), _BATCH):
+        batches.append(surface.signed_distances(points[start : start + _BATCH] - origin))
+        show("measuring distances", min(start + _BATCH, len(points)), len(points), "points")
     distances, normals = map(np.concatenate, zip(*batches, strict=True))
     near = np.abs(distances) <= max_distance_m
     if not near.any():

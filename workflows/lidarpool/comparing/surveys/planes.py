@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.errors import LidarError
+from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
 
@@ -51,7 +52,11 @@ def neighborhood_radius(points: Floats) -> float:
 
 
 def plane_deviations(
-    points: SurveyPoints, reference: SurveyPoints, radius_m: float, max_distance_m: float
+    points: SurveyPoints,
+    reference: SurveyPoints,
+    radius_m: float,
+    max_distance_m: float,
+    show: WritingProgress = lambda *_: None,
 ) -> Deviations:
     """Return the signed distances from points to planes through the reference.
 
@@ -67,10 +72,12 @@ def plane_deviations(
         Maximum radius of the neighborhoods.
     max_distance_m
         Points farther than this from the reference have no counterpart.
+    show
+        Called when the planes for a part of the points have been fitted.
     """
     origin = reference.positions.mean(axis=0)
     points = points.relative_to(origin)
-    planes = _ReferencePlanes(reference.relative_to(origin), points, radius_m)
+    planes = _ReferencePlanes(reference.relative_to(origin), points, radius_m, show)
     distances, roughness = np.full((2, len(points)), np.nan)
     normals = np.zeros((len(points), 3), np.float32)
     too_far = 0
@@ -83,6 +90,7 @@ def plane_deviations(
         distances[rows], roughness[rows], normals[rows] = planes.distances(
             rows, nearest[is_near, 0]
         )
+        show("fitting planes", min(start + _BATCH, len(points)), len(points), "points")
     found = np.isfinite(distances)
     if not found.any():
         raise LidarError(
@@ -105,10 +113,17 @@ def plane_deviations(
 class _ReferencePlanes:
     """Oriented planes through the neighborhoods of reference points."""
 
-    def __init__(self, reference: SurveyPoints, points: SurveyPoints, radius_m: float) -> None:
+    def __init__(
+        self,
+        reference: SurveyPoints,
+        points: SurveyPoints,
+        radius_m: float,
+        show: WritingProgress,
+    ) -> None:
         self.search = NeighborSearch(reference.positions, radius_m)
         self._reference = reference
         self._points = points
+        self._show = show
         self._surfaces = self._orient_surfaces(radius_m)
 
     def _orient_surfaces(self, spacing_m: float) -> OrientedPoints:
@@ -117,7 +132,12 @@ class _ReferencePlanes:
         while len(rows) > _MAX_ORIENTED:
             spacing_m *= 1.1 * np.sqrt(len(rows) / _MAX_ORIENTED)
             rows = thin_out(self._reference.positions, spacing_m)
-        planes = self._fit(rows)
+        parts = []
+        for start in range(0, len(rows), _BATCH):
+            parts.append(self._fit(rows[start : start + _BATCH]))
+            fitted = min(start + _BATCH, len(rows))
+            self._show("finding surfaces", fitted, len(rows), "planes")
+        planes = _Planes(*map(np.concatenate, zip(*parts, strict=True)))
         if planes.are_valid.any():
             rows, planes = rows[planes.are_valid], planes.select(planes.are_valid)
         scanners = nearby_scanners(self._reference, rows, self._points)
