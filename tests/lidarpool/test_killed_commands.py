@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -30,7 +31,7 @@ from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
 from lidarpool.report.result_pictures import publish_pictures
-from lidarpool.work import publishing
+from lidarpool.work import publishing, work
 from lidarpool.work.work import FOLDER, Step
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
@@ -63,11 +64,14 @@ class User:
         What a kill may leave.
     resumes
         Whether finished items are stored.
+    source
+        Input file of a command that stores finished items.
     """
 
     last = ""
     states = ORDER
     resumes = False
+    source = ""
 
     def prepare(self, folder: Path, patches: pytest.MonkeyPatch) -> None:
         """Write the inputs to a folder, and replace the computing."""
@@ -75,6 +79,11 @@ class User:
     def run(self, inputs: Path, outputs: Path, version: int, *, resume: bool = False) -> None:
         """Write a result, or continue with one, and replace an earlier one."""
         raise NotImplementedError
+
+
+@cache
+def drive_points():
+    return recorded_points(4)
 
 
 @dataclass(frozen=True)
@@ -92,9 +101,10 @@ class _FakeTwin:
 class TwinUser(User):
     last = "out/scenario.yaml"
     resumes = True
+    source = "drive/000001.pcd"
 
     def prepare(self, folder, patches):
-        drive = write_pcd_drive(folder / "drive", recorded_points(4))
+        drive = write_pcd_drive(folder / "drive", drive_points())
         recorded = RecordedSweeps.open(drive)
 
         def compute(building, track):
@@ -113,22 +123,25 @@ class TwinUser(User):
         twin(drive, out=out, voxel_m=0.1 * version, resume=resume, overwrite=True)
 
 
+_AUGMENTED: dict[tuple, tuple] = {}  # what has been computed for all tests
+
+
 class AugmentUser(User):
     """Augmentation of a folder, which is replaced as a whole."""
 
     last = "out"
     resumes = True
+    source = "drive/000001.pcd"
 
     def prepare(self, folder, patches):
-        write_pcd_drive(folder / "drive", recorded_points(2))
-        stored = {}
+        write_pcd_drive(folder / "drive", drive_points()[:2])
         compute = PartProcess.files
 
         def load(part, number, variant):
             key = part.file.path.name, part.plan.variants[variant].seed, number
-            if key not in stored:
-                stored[key] = compute(part, number, variant)
-            return stored[key]
+            if key not in _AUGMENTED:
+                _AUGMENTED[key] = compute(part, number, variant)
+            return _AUGMENTED[key]
 
         patches.setattr(PartProcess, "files", load)
         patches.setattr(PartProcess, "prepare", lambda part, variant: None)
@@ -161,11 +174,12 @@ class AugmentCampaignUser(AugmentUser):
     def prepare(self, folder, patches):
         super().prepare(folder, patches)
         (folder / "effects.yaml").write_text("weather: {visibility_km: 1}\n")
-        (folder / "campaign.yaml").write_text("base: effects.yaml\ncount: 3\n")
+        for version in (1, 2):
+            text = f"base: effects.yaml\ncount: {4 - version}\nseed: {version}\n"
+            (folder / f"{version}.yaml").write_text(text)
 
     def augmentation(self, inputs, version):
-        variants = CampaignVariants(inputs / "campaign.yaml")
-        variants.count = 4 - version
+        variants = CampaignVariants(inputs / f"{version}.yaml")
         return replace(super().augmentation(inputs, version), variants=variants)
 
 
@@ -369,3 +383,111 @@ def test_wherever_a_command_is_killed(kills):
     left = [kills.kill(position) for position in range(kills.changes + 1)]
     assert left == sorted(left, key=ORDER.index)
     assert {*left} == {*kills.user.states}
+
+
+# -- unfinished work -------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=[name for name, user in USERS.items() if user.resumes])
+def command(request, tmp_path, monkeypatch):
+    """Return a command that stores finished items."""
+    made = Kills(USERS[request.param](), tmp_path)
+    made.prepare(monkeypatch)
+    made._restore()
+    return made
+
+
+@pytest.fixture
+def on_stored(monkeypatch):
+    """Return a function that registers a call for when the first item is stored."""
+
+    def register(call):
+        pending = [call]
+        store = work._store
+
+        def store_and_call(*arguments):
+            store(*arguments)
+            if pending:
+                pending.pop()()
+
+        monkeypatch.setattr(work, "_store", store_and_call)
+
+    return register
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+def stored_files(folder):
+    """Return all files of finished items."""
+    return [path for path in folder.rglob("*") if path.is_file() and path.parent.name != FOLDER]
+
+
+def test_an_interrupted_command_states_how_to_continue(command, on_stored):
+    on_stored(interrupt)
+    with pytest.raises(KeyboardInterrupt) as info:
+        command.run(2)
+    (note,) = info.value.__notes__
+    assert "Continue with `--resume`." in note
+    assert command._check() == "earlier"
+    with pytest.raises(
+        LidarError, match=r"an unfinished \w+\. Continue it with `--resume`, or rem"
+    ):
+        command.run(2)
+    with pytest.raises(LidarError, match=r"an unfinished \w+ with different inputs \(\w+\)"):
+        command.run(1, resume=True)
+    command.run(2, resume=True)
+    assert files(command.outputs) == command.new
+
+
+def test_nothing_is_kept_without_finished_items(command, monkeypatch):
+    monkeypatch.setattr(work, "_store", lambda *arguments: interrupt())
+    with pytest.raises(KeyboardInterrupt) as info:
+        command.run(2)
+    assert not hasattr(info.value, "__notes__")
+    assert files(command.outputs) == command.earlier
+
+
+def test_changed_inputs_of_unfinished_work_are_named(command, on_stored):
+    on_stored(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        command.run(2)
+    os.utime(command.inputs / command.user.source, (1, 1))
+    with pytest.raises(LidarError, match=r"different inputs \(recording\)\. Repeat the original"):
+        command.run(2, resume=True)
+    assert command._check() == "earlier"
+
+
+def test_inputs_that_change_meanwhile_are_refused(command, on_stored):
+    source = command.inputs / command.user.source
+    on_stored(lambda: os.utime(source, (1, 1)))
+    with pytest.raises(LidarError, match=r" has changed since the \w+ began\. Start again with"):
+        command.run(2)
+    assert command._check() == "earlier"
+
+
+def test_a_result_has_one_writer(command, on_stored):
+    def run_again():
+        with pytest.raises(LidarError, match="Another run or export is using"):
+            command.run(2, resume=True)
+
+    on_stored(run_again)
+    command.run(2)
+    assert files(command.outputs) == command.new
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[: len(data) // 2], lambda data: data[:-1] + b"?", lambda data: b""]
+)
+def test_damaged_items_are_replaced(command, monkeypatch, damage):
+    with monkeypatch.context() as patches:
+        patches.setattr(os, "fsync", lambda handle: interrupt())  # when all items are stored
+        with pytest.raises(KeyboardInterrupt):
+            command.run(2)
+    paths = [path for path in stored_files(command.outputs) if FOLDER in path.parts]
+    assert len(paths) > 3
+    for path in paths:
+        path.write_bytes(damage(path.read_bytes()))
+    command.run(2, resume=True)
+    assert files(command.outputs) == command.new
