@@ -33,7 +33,7 @@ import heapq
 import itertools
 import math
 import time
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -45,6 +45,7 @@ from .internals.held_tasks import (
     LOANS,
     add_holding_rules,
     assign_held_tasks,
+    hold_task,
     priority_of_assigned,
     priority_of_waiting,
     refresh_waiting_times,
@@ -158,12 +159,11 @@ class PartitionQueue:
         # the worker.
         used = load.used - min(load.tied, 1) if load.tied else load.used
         had_room = worker in self.with_room
-        if slots and has_room(slots, used, load.seconds, had_room):
-            if not had_room:
+        if (slots and has_room(slots, used, load.seconds, had_room)) != had_room:
+            if had_room:
+                del self.with_room[worker]
+            else:
                 self.with_room[worker] = None
-        elif had_room:
-            del self.with_room[worker]
-
         if load.free or load.used < slots:
             self._set_free(load, max(0.0, slots - load.used))
 
@@ -247,14 +247,12 @@ class PartitionQueue:
     def heads(self, client: str) -> list[_HeldTask]:
         """Return the first task of a client for each kind of bounds, in their order."""
         heaps = self.heaps.get(client, {})
-        heads: list[tuple[Any, int, _HeldTask]] = []
-        for bounds in [*heaps]:
-            heap = heaps[bounds]
+        heads: list[_HeldTask] = []
+        for bounds, heap in [*heaps.items()]:
             while heap:
-                priority, number, key = heap[0]
-                held = self.held.get(key)
+                held = self.held.get(heap[0][2])
                 if held is not None and held.client == client and held.bounds == bounds:
-                    heads.append((priority, number, held))
+                    heads.append(held)
                     break
                 heapq.heappop(heap)
             else:
@@ -262,8 +260,8 @@ class PartitionQueue:
         if not heaps:
             self.heaps.pop(client, None)
         if len(heads) > 1:
-            heads.sort()
-        return [held for _, _, held in heads]
+            heads.sort(key=lambda held: heaps[held.bounds][0])
+        return heads
 
 
 class Shares(SchedulerPlugin):
@@ -307,7 +305,10 @@ class Shares(SchedulerPlugin):
         for worker in workers_declaring(self.scheduler, name):
             for task in worker.processing:
                 if name in (task.resource_restrictions or ()):
-                    self._start(queue, task, self._client_of(task), worker)
+                    now = time.monotonic()
+                    held = _HeldTask(self._client_of(task), _bounds_of(task), now, task)
+                    queue.policy.add_waiting(held.client, now)
+                    self._start(queue, held, worker, now)
             queue.update_worker(worker)
         if self._check is None:
             self._schedule_check()
@@ -474,53 +475,51 @@ class Shares(SchedulerPlugin):
             return NotImplemented
         if task.key in queue.held:
             return None
-        client = self._client_of(task)
         task.priority = priority_of_waiting(task)
-        bounds = _bounds_of(task)
-        if not queue.held and (worker := self._worker_for(queue, task, bounds)) is not None:
-            self._start(queue, task, client, worker)
+        now = time.monotonic()
+        held = _HeldTask(self._client_of(task), _bounds_of(task), now, task)
+        if not queue.held and (worker := self._worker_for(queue, held)) is not None:
+            queue.policy.add_waiting(held.client, now)
+            self._start(queue, held, worker, now)
             return worker
-        queue.hold(task, _HeldTask(client, bounds, time.monotonic(), task))
-        if queue.with_room or bounds.is_tied:
+        queue.hold(task, held)
+        if task.state == "waiting":
+            hold_task(self.scheduler, task, now)
+        if queue.with_room or held.bounds.is_tied:
             self._dispatch_soon()
         return None
 
     def _start(
         self,
         queue: PartitionQueue,
-        task: Any,
-        client: str,
+        held: _HeldTask,
         worker: Any,
-        held: _HeldTask | None = None,
-        passed_over: Iterable[str] = (),
+        now: float,
+        passed_over: Collection[str] = (),
     ) -> None:
         """Charge a client for a task, and add the task to the load of a worker."""
+        task = held.task
+        key = task.key
+        bounds = held.bounds
         slots = task.resource_restrictions[queue.name]
-        now = time.monotonic()
-        if held is None:
-            queue.policy.add_waiting(client, now)
+        waited_s = now - held.since
         charge = queue.policy.start(
-            task.key,
-            client,
-            task.prefix.name,
-            slots,
-            now,
-            0.0 if held is None else now - held.since,
-            [*passed_over],
+            key, held.client, task.prefix.name, slots, now, waited_s, passed_over
         )
-        is_tied = bool(task.worker_restrictions) or submitter_of(task) is not None
         seconds = slots * charge.expected_s
-        if task.key in self._isolated:
+        if key in self._isolated:
             slots, seconds = worker.resources.get(queue.name, slots), _ALONE_S
-        queue.assign(task.key, _Assignment(worker, slots, seconds, is_tied, memory_of(task)))
-        self._assigned_in[task.key] = queue
+        queue.assign(key, _Assignment(worker, slots, seconds, bounds.is_tied, bounds.memory))
+        self._assigned_in[key] = queue
         task.priority = priority_of_assigned(self.scheduler, task, next(self._numbers))
 
-    def _worker_for(self, queue: PartitionQueue, task: Any, bounds: _Bounds) -> Any:
+    def _worker_for(self, queue: PartitionQueue, held: _HeldTask) -> Any:
         """Return a worker that has room for a task, or None."""
+        task = held.task
+        bounds = held.bounds
         slots = task.resource_restrictions[queue.name]
         allowed = None
-        if bounds.is_restricted:
+        if bounds is not _ANY_WORKER and bounds.is_restricted:
             allowed = self.scheduler.valid_workers(task) or ()
         if queue.with_room:
             worker = self._worker_with_room(queue, task, slots, allowed)
@@ -550,6 +549,8 @@ class Shares(SchedulerPlugin):
                 enough = queue.loads[worker].used + slots <= worker.resources[queue.name]
                 (free if enough else others).append(worker)
                 if len(free) == MAX_COMPARED:
+                    break
+                if len(others) == MAX_COMPARED and not queue.free_slots:
                     break
         candidates = free or others[:MAX_COMPARED]
         if len(candidates) <= 1:
@@ -646,6 +647,7 @@ class Shares(SchedulerPlugin):
 
     def _dispatch_from(self, queue: PartitionQueue) -> None:
         chosen: list[Any] = []
+        now = time.monotonic()
         while queue.held and (queue.with_room or queue.tied_held):
             queue.reserved = None
             found = self._next_task(queue)
@@ -653,7 +655,7 @@ class Shares(SchedulerPlugin):
                 break
             held, worker, passed_over = found
             queue.release(held.task.key)
-            self._start(queue, held.task, held.client, worker, held, passed_over)
+            self._start(queue, held, worker, now, passed_over)
             self._chosen[held.task] = worker
             chosen.append(held.task)
         if chosen:
@@ -667,7 +669,7 @@ class Shares(SchedulerPlugin):
             for held in queue.heads(client):
                 if not (queue.with_room or held.bounds.is_tied):
                     continue
-                worker = self._worker_for(queue, held.task, held.bounds)
+                worker = self._worker_for(queue, held)
                 if worker is not None:
                     in_turn = worker in queue.with_room
                     return held, worker, passed_over if in_turn else []

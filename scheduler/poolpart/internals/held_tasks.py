@@ -70,6 +70,17 @@ def _may_run(scheduler: Any, task: Any, worker: Any) -> bool:
     return valid is None or worker in valid
 
 
+def hold_task(scheduler: Any, task: Any, now: float) -> None:
+    """Change the state of a task to "no-worker" while Dask chooses its worker.
+
+    Dask would make this change in a further transition, which costs several microseconds per task.
+    The transition that chooses the worker reports the new state instead. `now` is the result of
+    `time.monotonic`.
+    """
+    task.state = "no-worker"
+    scheduler.unrunnable[task] = now
+
+
 def assign_held_tasks(scheduler: Any, tasks: Iterable[Any]) -> None:
     """Assign tasks in the state "no-worker" to workers, in the given order."""
     # Dask follows the last recommendation first.

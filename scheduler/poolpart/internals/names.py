@@ -205,6 +205,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}.unrunnable",
             f"{_SCHEDULER}.no_workers_timeout",
             f"{_SCHEDULER}.generation",
+            f"{_SCHEDULER_TASK}.state",
             f"{_SCHEDULER_TASK}.priority",
             f"{_SCHEDULER_TASK}.who_wants",
             f"{_SCHEDULER_TASK}.annotations",
