@@ -623,5 +623,8 @@ def test_points_that_a_later_ray_passed_have_moved(has_rings):
     assert (~masks[3])[boxed[3]].mean() > 0.9
     for number, mask in masks.items():
         assert mask[~boxed[number]].mean() > 0.995
+    # An earlier or a later sweep is sufficient.
+    for pair in ([2, 3], [3, 4]):
+        assert (~find_stationary_points(sweeps, pair)[3])[boxed[3]].mean() > 0.9
     # Without the other sweeps, nothing is known to have moved.
     assert find_stationary_points(sweeps, [3])[3].all()
