@@ -67,6 +67,18 @@ def _hears_of_worker(dask_worker):
     return dask_worker.process.status == Status.running
 
 
+def set_status(client, name, status):
+    """Pause or resume a worker of this process, in its event loop.
+
+    A message that is sent from another thread may wait until the loop is woken by something else.
+    """
+
+    async def change():
+        client.cluster.workers[name].status = status
+
+    client.sync(change)
+
+
 def join(client, name, **options):
     """Start a further worker, like the first worker but for the given options."""
     spec = next(iter(client.cluster.worker_spec.values()))

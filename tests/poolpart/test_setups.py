@@ -13,7 +13,7 @@ from weakref import WeakSet
 import pytest
 from distributed import Client, Event
 from distributed.core import Status
-from tests.poolpart.helpers import LONG_S, kill, wait_for
+from tests.poolpart.helpers import LONG_S, kill, set_status, wait_for
 
 from poolpart import Partition, Pool, PoolError, TaskTimeoutError, rest, setups
 
@@ -126,15 +126,6 @@ def wait_at_2(model, item, started, release):
         Event(started).set()
         wait_for(release)
     return id(model)
-
-
-def set_status(client, name, status):
-    """Pause or resume a worker, in its event loop."""
-
-    async def change():
-        client.cluster.workers[name].status = status
-
-    client.sync(change)
 
 
 def test_a_paused_worker_releases_what_no_task_uses(start, monkeypatch, wait_until, caplog):

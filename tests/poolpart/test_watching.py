@@ -8,7 +8,7 @@ import time
 import pytest
 from distributed import Event, get_worker
 from distributed.core import Status
-from tests.poolpart.helpers import LONG_S, wait_for, worker_name
+from tests.poolpart.helpers import LONG_S, set_status, wait_for, worker_name
 
 from poolpart import Partition, Pool, TaskTimeoutError, cancelled
 
@@ -43,14 +43,14 @@ def test_tasks_do_not_wait_while_another_slot_is_free(start, event, wait_until, 
     x = scheduler.workers[client.cluster.workers["x"].address]
     wait_until(lambda: any(task.key in {f.key for f in waiting} for task in x.processing))
     if why == "paused":
-        client.cluster.workers["x"].status = Status.paused
+        set_status(client, "x", Status.paused)
     if why == "canceled":
         long.cancel()
     gate.set()
     assert client.gather(waiting) == ["y"] * 6
     if why == "canceled":  # the scheduler assumes that both workers are free
         assert client.gather([part.submit(worker_name) for _ in range(4)]) == ["y"] * 4
-    client.cluster.workers["x"].status = Status.running
+    set_status(client, "x", Status.running)
     release.set()
     assert other.result(LONG_S)
     assert why == "canceled" or long.result(LONG_S) == "x"
