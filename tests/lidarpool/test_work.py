@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import dataclass
 
@@ -262,3 +263,16 @@ def test_files_and_folders_replace_those_with_the_same_names(tmp_path):
     (staged / "last").write_text("new")
     move_into_place(staged, target, last="last")
     assert files(target) == {"cloud": "new", "page/1.html": "new", "last": "new"}
+
+
+def test_items_are_not_flushed_to_the_disk_because_their_checksums_are_compared(
+    tmp_path, monkeypatch
+):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", flushed.append)
+    with Work.open(tmp_path, Inputs({}, {"options": 1}), noun="sum") as work:
+        assert len(list(work.each(SQUARE, map, square, [5, 6]))) == 2
+        assert not flushed
+        with work.publishing("last") as staged:
+            (staged / "last").write_text("new")
+        assert flushed

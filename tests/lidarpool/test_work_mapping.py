@@ -97,7 +97,7 @@ def test_an_error_that_cannot_be_pickled_keeps_its_words(run):
 
 
 def die_once(part):
-    """Kill the process of the third part when it runs first, and count how many run beside it."""
+    """Kill the process of the fourth part when it runs first."""
     if part.number == 24:
         mark = part.folder / "died"
         if not mark.exists():
@@ -110,6 +110,40 @@ def test_an_item_whose_process_dies_is_tried_again(run, tmp_path):
     parts = [Part(8 * n, tmp_path) for n in range(10)]
     assert list(run(die_once, parts)) == [8 * n for n in range(10)]
     assert (tmp_path / "died").exists()
+
+
+def wait_for(path):
+    while not path.exists():
+        time.sleep(0.01)
+
+
+def list_parts_in_flight(part):
+    """Kill the process of part 0 when part 1 is processed and the process of part 2 is idle."""
+    mine = part.folder / f"part {part.number}"
+    died, one, two = (part.folder / name for name in ("died", "1", "2"))
+    mine.touch()
+    if part.number == 0 and not died.exists():
+        wait_for(one)
+        wait_for(two)
+        time.sleep(0.1)
+        died.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if part.number == 1:
+        one.touch()
+        wait_for(died)
+        time.sleep(0.5)  # part 0 would be processed meanwhile
+    found = sorted(path.name for path in part.folder.glob("part *"))
+    mine.unlink()
+    if part.number == 2:
+        two.touch()
+    return found
+
+
+def test_an_item_is_tried_again_while_no_other_item_is_processed(tmp_path):
+    parts = [Part(number, tmp_path) for number in range(3)]
+    with parallel_map(None, 3, 1, workers=3) as run:
+        zero, one, _ = run(list_parts_in_flight, parts)
+    assert zero == ["part 0"] and one == ["part 0", "part 1"]
 
 
 def die_at_24(part):

@@ -108,7 +108,6 @@ class _Calls:
         self._function = function
         self._items = iter(items)
         self._started = 0  # number of items that were taken from the iterable
-        self._is_exhausted = False
         self._retries = deque[_Item]()  # items whose process died
         self._busy: dict[Connection, tuple[_Process, _Item]] = {}
         self._outcomes: dict[int, _Outcome] = {}  # by item number, until they are yielded
@@ -154,12 +153,9 @@ class _Calls:
             self._send(item)
 
     def _next_item(self) -> _Item | None:
-        if self._is_exhausted:
-            return None
         try:
             value = next(self._items)
         except StopIteration:
-            self._is_exhausted = True
             return None
         number = self._started
         self._started += 1
