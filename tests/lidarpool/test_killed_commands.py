@@ -27,6 +27,9 @@ from lidarpool.augmentation.sweep_tasks import PartProcess, RecordingFile
 from lidarpool.augmentation.variants import CampaignVariants, Variants
 from lidarpool.comparing.comparison_files import write_comparison
 from lidarpool.comparing.fit import charts, fitting
+from lidarpool.mounting import pictures
+from lidarpool.mounting.evaluation import MountEvaluator, MountResult
+from lidarpool.mounting.study_files import rank_mounts
 from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
@@ -66,12 +69,15 @@ class User:
         Whether finished items are stored.
     source
         Input file of a command that stores finished items.
+    noun
+        Name of this input in messages.
     """
 
     last = ""
     states = ORDER
     resumes = False
     source = ""
+    noun = "recording"
 
     def prepare(self, folder: Path, patches: pytest.MonkeyPatch) -> None:
         """Write the inputs to a folder, and replace the computing."""
@@ -183,6 +189,53 @@ class AugmentCampaignUser(AugmentUser):
         return replace(super().augmentation(inputs, version), variants=variants)
 
 
+class Picture(NamedTuple):
+    text: str
+
+    def svg(self):
+        return self.text
+
+
+VEHICLE = """
+body: {{box: [4, 2, 1], at: [0, 0, 0.3]}}
+sensors: {{top: {{model: velodyne/vlp16, mounts: [[0, 0, 1.{version}], [1, 0, 1.{version}]]}}}}
+targets: [cone]
+region: {{distances_m: [6], bearings: 2, headings_deg: [0]}}
+map: {{cell_m: 2, margin_m: 2}}
+"""
+
+
+class MountUser(User):
+    last = "out/best.yaml"
+    resumes = True
+    source = "2.yaml"
+    noun = "vehicle"
+
+    def prepare(self, folder, patches):
+        for version in (1, 2):
+            (folder / f"{version}.yaml").write_text(VEHICLE.format(version=5 + version))
+
+        def evaluate(evaluator, mounted):
+            x, _, z = mounted.mount.position
+            points = np.full(len(evaluator.placements), round(20 * (x + z)))
+            heights = np.full((evaluator.grid.rows, evaluator.grid.columns), np.float32(z))
+            return MountResult(points, heights, heights, 100, 3, 0, np.zeros((90, 180), np.float32))
+
+        patches.setattr(MountEvaluator, "__call__", evaluate)
+        draw = cache(pictures.draw_all)
+        first = []
+
+        def draw_all(result):
+            first.append(result)
+            return {name: Picture(result.study.vehicle.source) for name in draw(first[0])}
+
+        patches.setattr(pictures, "draw_all", draw_all)
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        file = inputs / f"{version}.yaml"
+        rank_mounts(file, outputs / "out", workers=1, resume=resume, overwrite=True)
+
+
 class CompareUser(User):
     last = "out/compare.json"
 
@@ -260,6 +313,7 @@ USERS: dict[str, Callable[[], User]] = {
     "augment": AugmentUser,
     "augment, file": AugmentFileUser,
     "augment, campaign": AugmentCampaignUser,
+    "mount": MountUser,
     "compare": CompareUser,
     "fit": FitUser,
     "plot": PlotUser,
@@ -454,7 +508,8 @@ def test_changed_inputs_of_unfinished_work_are_named(command, on_stored):
     with pytest.raises(KeyboardInterrupt):
         command.run(2)
     os.utime(command.inputs / command.user.source, (1, 1))
-    with pytest.raises(LidarError, match=r"different inputs \(recording\)\. Repeat the original"):
+    words = rf"different inputs \({command.user.noun}\)\. Repeat the original"
+    with pytest.raises(LidarError, match=words):
         command.run(2, resume=True)
     assert command._check() == "earlier"
 

@@ -13,7 +13,7 @@ from tests.kills import is_killed
 
 from lidarpool.work import publishing
 from lidarpool.work.publishing import move_into_place
-from lidarpool.work.work import FOLDER, Inputs, Step, Work
+from lidarpool.work.work import FOLDER, FileStep, Inputs, Step, Work, link_files
 from lidarsim.errors import LidarError
 
 
@@ -249,6 +249,66 @@ def test_a_record_is_loaded_alone(sums, monkeypatch, tmp_path):
         (tmp_path / FOLDER / "square" / "000001" / "0.npz").write_bytes(b"PK")
         with pytest.raises(LidarError, match="square/000001 is damaged"):
             work.load(SQUARE, 1, 0)
+
+
+def test_numbers_and_strings_of_records_keep_their_types(tmp_path):
+    @dataclass(frozen=True)
+    class Statistics:
+        count: int
+        share: float
+        source: str
+
+    stated = Statistics(3, 0.1, "a cloud")
+    with Work.open(tmp_path, Inputs({}, {}), noun="sum") as work:
+        (loaded,) = work.once(Step("statistics", (Statistics,)), lambda: (stated,))
+    assert loaded == stated
+    assert [type(value) for value in vars(loaded).values()] == [int, float, str]
+
+
+def test_files_of_items_are_stored_under_their_keys_and_linked(tmp_path):
+    def contents(number):
+        computed.append(number)
+        return {f"sub/{number}.bin": bytes([number]), "all.txt": b"all"}
+
+    step = FileStep("files")
+    computed = []
+    target, staged = tmp_path / "out", tmp_path / "staged"
+    with Work.open(target, Inputs({}, {}), noun="sum") as work:
+        keys = ["three", "four"]
+        for found in work.each(step, map, contents, [3, 4], keys):
+            link_files(found, staged)
+        assert (staged / "sub/4.bin").read_bytes() == b"\4"
+        assert sorted(files(staged)) == ["all.txt", "sub/3.bin", "sub/4.bin"]
+        (target / FOLDER / "files/four/sub/4.bin").write_bytes(b"\5")
+        four, three = work.each(step, map, contents, [4, 3], keys[::-1])
+        assert [*four] == ["sub/4.bin", "all.txt"] and three["sub/3.bin"].read_bytes() == b"\3"
+        assert four["sub/4.bin"].read_bytes() == b"\4"
+    assert computed == [3, 4, 4]
+
+
+def test_merged_folders_keep_the_files_of_others(tmp_path):
+    target, staged = tmp_path / "out", tmp_path / "staged"
+    for folder in (target / "a" / "theirs", target / "a" / "old", staged / "a" / "new"):
+        folder.mkdir(parents=True)
+        (folder / "1").write_text(folder.name)
+    (target / "a" / "2").write_text("earlier")
+    (staged / "a" / "2").write_text("new")
+    (staged / "last").write_text("new")
+    move_into_place(staged, target, last="last", remove=["a/old/1", "a/none/1"], merge=True)
+    assert files(target) == {"a/theirs/1": "theirs", "a/new/1": "new", "a/2": "new", "last": "new"}
+    assert not (target / "a/old").exists()
+
+
+def test_links_in_merged_folders_are_not_followed(tmp_path):
+    target, staged, other = (tmp_path / name for name in ("out", "staged", "other"))
+    for folder in (target, other, staged / "a"):
+        folder.mkdir(parents=True)
+    (target / "a").symlink_to(other)
+    (staged / "a" / "1").write_text("new")
+    (staged / "last").write_text("new")
+    with pytest.raises(LidarError, match="is a symbolic link"):
+        move_into_place(staged, target, last="last", merge=True)
+    assert files(other) == {}
 
 
 def test_files_and_folders_replace_those_with_the_same_names(tmp_path):

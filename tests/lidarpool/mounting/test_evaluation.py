@@ -67,7 +67,7 @@ def cells(a_study):
 def test_a_ring_meets_level_ground_at_its_height_over_the_tangent(folder):
     """Objects of height h are seen from (H - h) / tan to H / tan: 9.64 to 11.34 m for 0.3 m."""
     one = study(folder, map={"margin_m": 15, "cell_m": 0.1})
-    lowest = evaluate(one).blind.lowest_m
+    lowest = evaluate(one).lowest_m
     distance = np.hypot(*cells(one))
     slope = math.tan(math.radians(RING_DEG))
     radius = HEIGHT_M / slope
@@ -115,7 +115,7 @@ def test_the_edge_of_a_roof_hides_the_ground_behind_it(folder):
     for along, across, edge in ((x, y, 2.0), (y, x, 0.9)):
         reach = edge * 1.8 / 0.3
         row = (np.abs(across) < 0.1) & (along > edge)
-        seen = row & (result.blind.lowest_m == 0)
+        seen = row & (result.lowest_m == 0)
         # The first ring outside the shadow is at most 0.5° farther.
         angle = math.degrees(math.atan(1.8 / reach))
         ring = 1.8 / math.tan(math.radians(math.floor(angle * 2) / 2))
@@ -123,9 +123,9 @@ def test_the_edge_of_a_roof_hides_the_ground_behind_it(folder):
         # In the shadow, objects are visible above the sight line.
         within = row & (along < 5)
         line = 1.8 - along[within] * 0.3 / edge
-        over = result.blind.lowest_m[within] - line
+        over = result.lowest_m[within] - line
         assert over.min() > -0.05 and over.max() < 0.005 + along[within].max() * math.radians(0.5)
-    open_view = result.blind.unobstructed_m[(np.abs(y) < 0.1) & (x > 5.2) & (x < 6)]
+    open_view = result.unobstructed_m[(np.abs(y) < 0.1) & (x > 5.2) & (x < 6)]
     assert open_view.min() < 0.01
     azimuth, depression = np.radians(np.meshgrid(np.arange(0, 360, 0.5), np.arange(0, 20.5, 0.5)))
     edge_m = np.minimum(
@@ -173,7 +173,7 @@ def test_points_are_limited_by_reflectance_and_weather(folder):
 def test_objects_on_the_map_are_seen_within_the_detection_range(folder):
     """At 10 % reflectance, objects are visible up to 8 m, and ground returns end before."""
     one = study(folder, noise={"detection_range_m": 8}, map={"margin_m": 14})
-    lowest = evaluate(one).blind.lowest_m
+    lowest = evaluate(one).lowest_m
     distance = np.hypot(*cells(one))
     horizontal = 8 * math.cos(math.radians(RING_DEG))
     assert distance[np.isfinite(lowest)].max() == pytest.approx(horizontal, abs=0.2)
@@ -186,7 +186,7 @@ def test_the_vehicle_blocks_beams_within_the_minimum_range(folder):
     blocked = evaluate(study(folder, "ring.yaml", roof))
     assert blocked.blocked == blocked.blocked_near == blocked.beams == 720
     assert blocked.points.tolist() == [0]
-    assert np.isinf(blocked.blind.lowest_m).all()
+    assert np.isinf(blocked.lowest_m).all()
     # A target within the minimum range has no points.
     region = {"distances_m": [0.5], "bearings": 1, "headings_deg": [0]}
     thin = {"plate": {"box": [0.5, 0.1, 1.8]}}

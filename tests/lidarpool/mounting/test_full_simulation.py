@@ -14,7 +14,7 @@ import poolpart.deploy
 from lidarpool import read_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.mounting.study import MountStudy
-from lidarpool.mounting.study_files import write_study
+from lidarpool.mounting.study_files import rank_mounts, write_study
 from lidarpool.scenario.mount_sections import VehicleFile
 
 VEHICLE = {
@@ -51,7 +51,7 @@ def test_points_are_those_of_a_run(tmp_path, monkeypatch):
     study = MountStudy.from_file(VehicleFile.from_data(VEHICLE))
     result = study.run(workers=1)
     assert [one.candidate.name for one in result.ranked] == ["nose", "roof"]
-    write_study(result, Path())
+    write_study(result, Path(), Path())
     best = yaml.safe_load(Path("best.yaml").read_text())
     placements = study.placements
     for place, one in enumerate(result.ranked):
@@ -86,17 +86,20 @@ def test_points_are_those_of_a_run(tmp_path, monkeypatch):
 
 
 @pytest.mark.extended
-def test_a_cluster_writes_the_same_bytes(tmp_path):
-    study = MountStudy.from_file(VehicleFile.from_data(VEHICLE))
-    for name in ("alone", "cluster"):
-        (tmp_path / name).mkdir()
-    write_study(study.run(workers=1), tmp_path / "alone")
+def test_processes_and_clusters_write_the_same_bytes(tmp_path):
+    vehicle = tmp_path / "vehicle.yaml"
+    vehicle.write_text(yaml.safe_dump(VEHICLE))
+    for workers in (1, 2):
+        rank_mounts(vehicle, tmp_path / f"by-{workers}", workers=workers)
     with poolpart.deploy.local_cluster({"OTHER": (2, 1)}) as cluster, Client(cluster) as client:
-        write_study(study.run(client=client), tmp_path / "cluster")
-    files = [path for path in (tmp_path / "alone").rglob("*") if path.is_file()]
-    assert len(files) == 8
-    for path in files:
-        assert (
-            path.read_bytes()
-            == (tmp_path / "cluster" / path.relative_to(tmp_path / "alone")).read_bytes()
-        )
+        rank_mounts(vehicle, tmp_path / "cluster", client=client)
+    alone, *others = (
+        {
+            path.relative_to(tmp_path / name).as_posix(): path.read_bytes()
+            for path in (tmp_path / name).rglob("*")
+            if path.is_file()
+        }
+        for name in ("by-1", "by-2", "cluster")
+    )
+    assert len(alone) == 8
+    assert others == [alone, alone]

@@ -9,7 +9,7 @@ import pytest
 
 from lidarpool import Pose
 from lidarpool.mounting.blind_loops import BeamSegments, CellGrid, lower_to_beams
-from lidarpool.mounting.evaluation import BlindMap, MountResult
+from lidarpool.mounting.evaluation import MountResult
 from lidarpool.mounting.placements import Placements, Target, grid_placements, pack_sweeps
 from lidarpool.mounting.ranking import (
     MountCandidate,
@@ -82,7 +82,7 @@ def result(points, lowest, unobstructed=None):
     """Return the evaluation of a sensor."""
     lowest = np.array(lowest, np.float32)
     open_m = lowest if unobstructed is None else np.array(unobstructed, np.float32)
-    return MountResult(np.array(points), BlindMap(lowest, open_m), 100, 7, 0, np.zeros((1, 1)))
+    return MountResult(np.array(points), lowest, open_m, 100, 7, 0, np.zeros((1, 1)))
 
 
 RULES = RankingRules((0.0, 0.3, 1.0), 0.3, 0.5, np.array([[1, 1, 1, 1], [1, 1, 1, 0]], bool), 0.25)

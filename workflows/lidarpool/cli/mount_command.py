@@ -33,6 +33,7 @@ _SHOWN = 10  # candidates in the printed table
 )
 @options.scheduler
 @options.workers
+@options.unfinished("ranking")
 @overwrite
 @options.as_json
 def mount(
@@ -42,6 +43,8 @@ def mount(
     scheduler: str | None,
     files: TlsFiles,
     workers: int | None,
+    resume: bool,
+    restart: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -58,37 +61,31 @@ def mount(
     Examples:
       lidarpool mount vehicle.yaml
       lidarpool mount vehicle.yaml --out mounts --overwrite
-      lidarpool mount vehicle.yaml --scheduler tcp://127.0.0.1:8786
+      lidarpool mount vehicle.yaml --resume --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - Click requires the character \b
     options.check_workers(workers, scheduler)
+    options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the vehicle", quiet=as_json)
-    from ..clouds.folder import check_not_existing, result_folder
-    from ..mounting.study import MountStudy, figures_of
-    from ..mounting.study_files import (
-        FIGURES_FILE,
-        PAGE_FILE,
-        SCENARIO_FILE,
-        STUDY_FILES,
-        target_files,
-        write_study,
-    )
+    from ..mounting.study import figures_of
+    from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, rank_mounts
     from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
-    from ..scenario.mount_sections import VehicleFile
     from .terminal import Terminal
 
     keep_freed_memory()
     terminal = Terminal(quiet=as_json)
     folder = Path(f"{vehicle.stem}-mounts") if out is None else out
-    with result_folder(folder):
-        check_not_existing((folder / name for name in STUDY_FILES), overwrite=overwrite)
-        study = MountStudy.from_file(VehicleFile.load(vehicle))
-        check_not_existing((folder / name for name in target_files(study)), overwrite=overwrite)
-        client = nullcontext() if scheduler is None else connect_client(scheduler, files)
-        with client as connected, terminal.status("simulating the sensors at all mounts"):
-            result = study.run(client=connected, workers=workers)
-        with terminal.status("drawing the pictures"):
-            write_study(result, folder)
+    with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
+        result = rank_mounts(
+            vehicle,
+            folder,
+            client=client,
+            workers=workers,
+            resume=resume,
+            restart=restart,
+            overwrite=overwrite,
+            status=terminal.status,
+        )
     options.print_results(figures_of(result), _lines(result), as_json)
     if not as_json:
         names = ", ".join((PAGE_FILE, FIGURES_FILE, SCENARIO_FILE))

@@ -236,6 +236,20 @@ def check_workers(workers: int | None, scheduler: str | None) -> None:
         )
 
 
+def unfinished(noun: str) -> Callable[[Command], Command]:
+    """Return a decorator that adds --resume and --restart to a command."""
+    return combine(
+        flag("--resume", help=f"Resume an unfinished {noun}, if there is one."),
+        flag("--restart", help=f"Discard an unfinished {noun} and start again."),
+    )
+
+
+def check_unfinished(*, resume: bool, restart: bool) -> None:
+    """Raise UsageError if unfinished work is both to be resumed and to be discarded."""
+    if resume and restart:
+        raise click.UsageError("`--resume` and `--restart` cannot be combined.")
+
+
 def scheduler(command: Command) -> Command:
     """Add the options for connecting to a running scheduler.
 

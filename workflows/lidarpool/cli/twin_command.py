@@ -57,8 +57,7 @@ if TYPE_CHECKING:
     "clusters).",
 )
 @options.scheduler
-@options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
-@options.flag("--restart", help="Discard an unfinished reconstruction and start again.")
+@options.unfinished("reconstruction")
 @overwrite
 @options.as_json
 def twin(
@@ -92,8 +91,7 @@ def twin(
     from ..reconstruction.twin import SCENARIO_FILE
     from ..run.cluster.connection import connect_client
 
-    if resume and restart:
-        raise click.UsageError("`--resume` and `--restart` cannot be combined.")
+    options.check_unfinished(resume=resume, restart=restart)
     keep_freed_memory()
 
     def report(line: str) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 from lidarsim.errors import LidarError, MissingFileError, as_sentence, explain_os_errors
 from lidarsim.io.storage import Storage, is_url, lock
 
+from ..work.work import Work
+
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
 
 
@@ -36,6 +38,23 @@ def check_not_existing(files: Iterable[Path], *, overwrite: bool) -> None:
         raise LidarError(
             f"{existing} already exists. Use another output with `--out`, or pass `--overwrite`."
         )
+
+
+def check_new_result(
+    folder: Path, names: Iterable[str], *, resume: bool, restart: bool, overwrite: bool
+) -> None:
+    """Check the options of a command that keeps finished items in its output folder.
+
+    Raises
+    ------
+    LidarError
+        If options contradict each other, or if one of the files exists and must not be overwritten.
+        Unfinished work that is resumed may replace files.
+    """
+    if resume and restart:
+        raise LidarError("`resume` and `restart` cannot be combined.")
+    replaces = overwrite or (resume and Work.is_unfinished(folder))
+    check_not_existing((folder / name for name in names), overwrite=replaces)
 
 
 @contextmanager

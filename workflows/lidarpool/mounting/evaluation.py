@@ -39,17 +39,6 @@ _BISECTIONS = 60
 _FARTHEST_M = 1e5
 
 
-class BlindMap(NamedTuple):
-    """Minimum height of an object that is visible to a sensor, for each cell of a map.
-
-    The arrays have shape (rows, columns), with the lowest y first. Cells that no beam reaches are
-    infinite, and cells whose ground returns light are 0.
-    """
-
-    lowest_m: Floats32
-    unobstructed_m: Floats32  # as `lowest_m`, without the vehicle
-
-
 class MountResult(NamedTuple):
     """Evaluation of a sensor at a mount.
 
@@ -57,8 +46,12 @@ class MountResult(NamedTuple):
     ----------
     points
         Number of points on each placement. Shape (p,).
-    blind
-        Blind area around the vehicle.
+    lowest_m
+        Minimum height of an object that is visible to the sensor, for each cell of the map. Cells
+        that no beam reaches are infinite, and cells whose ground returns light are 0. Shape (rows,
+        columns), with the lowest y first.
+    unobstructed_m
+        As `lowest_m`, without the vehicle.
     beams
         Number of beams in a revolution.
     blocked
@@ -71,7 +64,8 @@ class MountResult(NamedTuple):
     """
 
     points: Ints
-    blind: BlindMap
+    lowest_m: Floats32
+    unobstructed_m: Floats32
     beams: int
     blocked: int
     blocked_near: int
@@ -137,9 +131,11 @@ class MountEvaluator:
         in_view = azimuths_in_view(beams.directions)
         points = self._points(mounted, seen, in_view)
         blocked = np.isfinite(blocked_m)
+        lowest_m, unobstructed_m = self._lowest_heights(mounted, seen, beams, blocked_m)
         return MountResult(
             points,
-            self._blind_map(mounted, seen, beams, blocked_m),
+            lowest_m,
+            unobstructed_m,
             len(blocked),
             int(blocked.sum()),
             int((blocked_m < mounted.sensor.min_range_m).sum()),
@@ -200,10 +196,13 @@ class MountEvaluator:
             points[sweep] = counts[first + taken]
         return points
 
-    def _blind_map(
+    def _lowest_heights(
         self, mounted: Mounted, seen: Mounted, beams: BeamSegments, blocked_m: Floats
-    ) -> BlindMap:
-        """Compute the blind area from the beams, and from the returns of the ground."""
+    ) -> tuple[Floats32, Floats32]:
+        """Compute the heights of the map from the beams, and from the returns of the ground.
+
+        Return the heights with and without the vehicle.
+        """
         scanner = self._scanner(seen, ())
         cloud = scanner.sweep(CENTER)
         on_ground = cloud["object"] == 1
@@ -218,7 +217,7 @@ class MountEvaluator:
             maps.append(np.maximum(lowest, _ABOVE_GROUND_M))
         columns, rows = self._cells(cloud.positions[on_ground])
         maps[0][rows, columns] = 0
-        return BlindMap(*(one.astype(np.float32) for one in maps))
+        return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
     def _cells(self, positions: Floats) -> tuple[Ints, Ints]:
         """Return the columns and rows of the cells that contain positions on the map."""

@@ -130,7 +130,7 @@ def draw_redundancy(result: MountRanking) -> Page:
     """Draw how many sensors of the best candidate see an object in each cell."""
     study = result.study
     height = study.rules.ranked_height_m
-    lowest = np.stack([sensor.blind.lowest_m for sensor in result.best.sensors.values()])
+    lowest = np.stack([sensor.lowest_m for sensor in result.best.sensors.values()])
     counts = (lowest <= np.float32(height)).sum(axis=0).clip(0, len(_COUNTS) - 1)
     page = Page(_SIZE)
     axes = page.chart((0.07, 0.08, 0.74, 0.76))

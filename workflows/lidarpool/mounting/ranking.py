@@ -11,7 +11,7 @@ import numpy as np
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
-from .evaluation import BlindMap, MountResult
+from .evaluation import MountResult
 from .placements import Placements
 
 _REACHED_M = 1.5e-3  # maximum height of beams that reach the ground
@@ -127,11 +127,11 @@ class _Areas(NamedTuple):
     all: float
 
     @classmethod
-    def from_maps(cls, maps: Sequence[BlindMap], rules: RankingRules) -> _Areas:
+    def from_results(cls, results: Sequence[MountResult], rules: RankingRules) -> _Areas:
         """Compute the areas for sensors with the given maps."""
-        lowest = np.stack([one.lowest_m for one in maps])
+        lowest = np.stack([one.lowest_m for one in results])
         combined = lowest.min(axis=0)
-        unobstructed = np.stack([one.unobstructed_m for one in maps]).min(axis=0)
+        unobstructed = np.stack([one.unobstructed_m for one in results]).min(axis=0)
 
         def area(mask: Bools) -> float:
             return float((mask & rules.outside).sum()) * rules.cell_m2
@@ -158,8 +158,8 @@ def evaluate_candidate(
     each = np.stack([result.points for result in sensors.values()])
     points = each.sum(axis=0)
     needed = np.array([target.points for target in placements.targets])[placements.target]
-    maps = [result.blind for result in sensors.values()]
-    areas = _Areas.from_maps(maps, rules)
+    results = [*sensors.values()]
+    areas = _Areas.from_results(results, rules)
     detection = _by_class(points >= needed, placements)
     rate = _weighted_rate(detection, placements)
     blind_share = areas.blind[rules.ranked_height_m] / max(areas.all, 1e-9)
@@ -167,7 +167,7 @@ def evaluate_candidate(
         candidate=candidate,
         sensors=sensors,
         points=points,
-        lowest_m=np.stack([one.lowest_m for one in maps]).min(axis=0),
+        lowest_m=np.stack([one.lowest_m for one in results]).min(axis=0),
         detection=detection,
         mean_points=_by_class(points, placements),
         redundancy=_by_class((each >= needed).sum(axis=0) >= 2, placements),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,10 +22,12 @@ from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
 from raybeam import RayCaster
 
+from ..identity.fingerprint import fingerprint
 from ..scenario.mount_sections import MAX_CELLS, BodyPart, VehicleFile
 from ..scenario.sections import ShapeSection
 from ..scenario.static_scene import FileFindings, ShapeLoader
-from ..work.mapping import parallel_map
+from ..work.mapping import MapFunction, parallel_map
+from ..work.work import Inputs, Step, Work
 from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements
@@ -37,6 +40,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _WORKER_BYTES = 1 << 30
+_MOUNTS = Step("mounts", (MountResult,))
+_KEY_LETTERS = 24
 _CARS = dict(zip(BODIES, MODELS, strict=True))
 
 
@@ -140,11 +145,28 @@ class MountStudy:
         """Targets that are evaluated."""
         return self.evaluator.placements
 
+    def inputs(self, file: Path) -> Inputs:
+        """Return what the files of the study depend on, including the vehicle file."""
+        vehicle = self.vehicle
+        models = [
+            vehicle.files.path(section.model)
+            for section in vehicle.sensors.values()
+            if section.model is not None and section.has_custom_model
+        ]
+        return Inputs(
+            {"vehicle": file, **{str(model): model for model in models}},
+            {
+                "body and targets": (self.evaluator, self.notes),
+                "sensors": [vehicle.mounted_sensor(name, CENTER) for name in vehicle.sensors],
+            },
+        )
+
     def run(
         self,
         *,
         client: Client | None = None,
         workers: int | None = None,
+        work: Work | None = None,
         progress: Callable[[int], None] = lambda done: None,
     ) -> MountRanking:
         """Evaluate all candidates, and rank them.
@@ -159,6 +181,8 @@ class MountStudy:
         workers
             Number of processes on this machine. By default, it depends on the number of cores and
             the memory.
+        work
+            Unfinished work that keeps the evaluated mounts, and provides those of an earlier run.
         progress
             Function that is called with the number of evaluated mounts.
 
@@ -171,15 +195,12 @@ class MountStudy:
         done = 0
         with parallel_map(client, self._batch, _WORKER_BYTES, workers) as run:
 
-            def evaluate(mounts: Sequence[tuple[str, Pose]]) -> list[MountResult]:
+            def evaluate(mounts: Sequence[tuple[str, Pose]]) -> Iterator[MountResult]:
                 nonlocal done
-                results = []
-                mounted = [vehicle.mounted_sensor(name, pose) for name, pose in mounts]
-                for result in run(self.evaluator, mounted):
-                    results.append(result)
+                for result in self._evaluate(run, mounts, work):
                     done += 1
                     progress(done)
-                return results
+                    yield result
 
             search = CandidateSearch(vehicle, self.placements, self.rules, evaluate)
             found = rank_candidates(search.run())
@@ -188,6 +209,17 @@ class MountStudy:
         front = pareto_front(found, self.rules.ranked_height_m)
         notes = ranking_notes(found, vehicle, self.placements, self.evaluator.body)
         return MountRanking(self, found, front, done, (*self.notes, *notes))
+
+    def _evaluate(
+        self, run: MapFunction, mounts: Sequence[tuple[str, Pose]], work: Work | None
+    ) -> Iterable[MountResult]:
+        mounted = [self.vehicle.mounted_sensor(name, pose) for name, pose in mounts]
+        if work is None:
+            return run(self.evaluator, mounted)
+        evaluator = self.evaluator
+        keys = [fingerprint(mount)[:_KEY_LETTERS] for mount in mounts]
+        results = work.each(_MOUNTS, run, lambda item: (evaluator(item),), mounted, keys)
+        return (result for (result,) in results)
 
     @property
     def _batch(self) -> int:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
-from lidarsim.errors import explain_os_errors
-from lidarsim.io.storage import staging
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
@@ -23,70 +22,116 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.words import printable
 from lidarview.page_templates import render_template
 
+from ..clouds.folder import check_new_result, result_folder
 from ..scenario.mount_sections import VehicleFile
+from ..work.work import Work
 from .evaluation import CONTACT_M
-from .pictures import draw_all
 from .study import MountRanking, MountStudy, figures_of, pose_entry
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 SCENARIO_FILE = "best.yaml"
 PAGE_FILE = "report.html"
 FIGURES_FILE = "mount.json"
 VEHICLE_FILE = "vehicle.glb"
-STUDY_FILES = (SCENARIO_FILE, FIGURES_FILE, PAGE_FILE, VEHICLE_FILE)  # files of every study
-TARGETS_FOLDER = "targets"
 SHOWN_CANDIDATES = 50  # rows of the table in the report
 _SHOWN_DISTANCE_M = 10.0  # distance of the targets in the scenario
-_SHOWN_TARGETS = 12
+_TARGET_FILES = tuple(f"targets/{number:02}.glb" for number in range(12))  # at most
 
 
-def target_files(study: MountStudy) -> list[str]:
-    """Return the names of the files that `write_study` writes in addition to `STUDY_FILES`."""
-    count = min(len(study.placements.meshes), _SHOWN_TARGETS)
-    return [f"{TARGETS_FOLDER}/{number:02}.glb" for number in range(count)]
+def rank_mounts(
+    vehicle: str | Path,
+    out: str | Path,
+    *,
+    client: Client | None = None,
+    workers: int | None = None,
+    resume: bool = False,
+    restart: bool = False,
+    overwrite: bool = False,
+    status: Callable[[str], AbstractContextManager[object]] = nullcontext,
+) -> MountRanking:
+    """Evaluate and rank the mounts in a vehicle file, and write the report and a scenario.
 
-
-def write_study(result: MountRanking, folder: Path) -> list[Path]:
-    """Write the report, the ranking and a scenario to a folder that the caller has locked.
+    Parameters
+    ----------
+    vehicle
+        Vehicle file.
+    out
+        Output folder. Evaluated mounts are kept in it until all files are written.
+    client, workers
+        As for `MountStudy.run`.
+    resume
+        Whether to continue an unfinished ranking in the folder.
+    restart
+        Whether to remove an unfinished ranking in the folder.
+    overwrite
+        Whether to replace existing files.
+    status
+        Function that returns a context for each step, and receives its description.
 
     Raises
     ------
     LidarError
-        If the folder cannot be written to.
+        If a file cannot be read, if a sensor cannot be simulated, if files exist or cannot be
+        written, if the folder contains an unfinished ranking that is neither resumed nor removed,
+        or if the cluster is lost.
     """
+    path, folder = Path(vehicle), Path(out)
+    names = (SCENARIO_FILE, FIGURES_FILE, PAGE_FILE, VEHICLE_FILE, *_TARGET_FILES)
+    check_new_result(folder, names, resume=resume, restart=restart, overwrite=overwrite)
+    study = MountStudy.from_file(VehicleFile.load(path))
     with (
-        explain_os_errors(f"The report cannot be written to {folder}", "free some disk space"),
-        staging(folder) as staged,
+        result_folder(folder),
+        Work.open(
+            folder, study.inputs(path), noun="ranking", resume=resume, restart=restart
+        ) as work,
     ):
-        (staged / TARGETS_FOLDER).mkdir()
-        meshes = {VEHICLE_FILE: result.study.evaluator.body}
-        files = target_files(result.study)
-        meshes |= dict(zip(files, result.study.placements.meshes, strict=False))
-        for name, mesh in meshes.items():
-            write_scene(staged / name, Scene.from_meshes([mesh]))
-        figures = figures_of(result)
-        pictures = {name: page.svg() for name, page in draw_all(result).items()}
-        report = figures | {"versions": {"lidarpool": __version__}, "name": _title(result)}
-        mounts = [
-            (candidate["name"], name, mount)
-            for candidate in figures["candidates"][:SHOWN_CANDIDATES]
-            for name, mount in candidate["sensors"].items()
-        ]
-        texts = {
-            SCENARIO_FILE: _scenario(result, folder, files),
-            FIGURES_FILE: json.dumps(figures, indent=1, allow_nan=False) + "\n",
-            PAGE_FILE: render_template(
-                "mount.html",
-                __name__,
-                report=report,
-                pictures=pictures,
-                shown=SHOWN_CANDIDATES,
-                mounts=mounts,
-            ),
-        }
-        for name, text in texts.items():
-            (staged / name).write_text(text, encoding="utf-8", newline="\n")
-        (folder / TARGETS_FOLDER).mkdir(exist_ok=True)
-        return [(staged / name).replace(folder / name) for name in (*texts, *meshes)]
+        with status("simulating the sensors at all mounts"):
+            result = study.run(client=client, workers=workers, work=work)
+        with (
+            status("drawing the pictures"),
+            work.publishing(SCENARIO_FILE, _TARGET_FILES, merge=True) as staged,
+        ):
+            write_study(result, staged, folder)
+    return result
+
+
+def write_study(result: MountRanking, staged: Path, folder: Path) -> None:
+    """Write the report, the ranking and a scenario to a staging folder.
+
+    `folder` is the folder to which the files will be moved.
+    """
+    files = _TARGET_FILES[: len(result.study.placements.meshes)]
+    meshes = {VEHICLE_FILE: result.study.evaluator.body}
+    meshes |= dict(zip(files, result.study.placements.meshes, strict=False))
+    for name, mesh in meshes.items():
+        (staged / name).parent.mkdir(exist_ok=True)
+        write_scene(staged / name, Scene.from_meshes([mesh]))
+    from .pictures import draw_all  # imports Matplotlib
+
+    figures = figures_of(result)
+    pictures = {name: page.svg() for name, page in draw_all(result).items()}
+    report = figures | {"versions": {"lidarpool": __version__}, "name": _title(result)}
+    mounts = [
+        (candidate["name"], name, mount)
+        for candidate in figures["candidates"][:SHOWN_CANDIDATES]
+        for name, mount in candidate["sensors"].items()
+    ]
+    texts = {
+        SCENARIO_FILE: _scenario(result, folder, files),
+        FIGURES_FILE: json.dumps(figures, indent=1, allow_nan=False) + "\n",
+        PAGE_FILE: render_template(
+            "mount.html",
+            __name__,
+            report=report,
+            pictures=pictures,
+            shown=SHOWN_CANDIDATES,
+            mounts=mounts,
+        ),
+    }
+    for name, text in texts.items():
+        (staged / name).write_text(text, encoding="utf-8", newline="\n")
 
 
 def _title(result: MountRanking) -> str:

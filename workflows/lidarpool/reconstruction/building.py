@@ -24,7 +24,7 @@ from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.words import plural
 
-from ..clouds.folder import check_not_existing, result_folder
+from ..clouds.folder import check_new_result, result_folder
 from ..clouds.kitti import CALIBRATION_FILE
 from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
@@ -217,15 +217,13 @@ def twin(
 
 def _check_output(out: str | Path | None, *, resume: bool, restart: bool, overwrite: bool) -> None:
     """Raise LidarError if options contradict each other, or if the result exists."""
-    if resume and restart:
-        raise LidarError("`resume` and `restart` cannot be combined.")
-    if out is None:
-        if resume or restart or overwrite:
-            name = "resume" if resume else "restart" if restart else "overwrite"
-            raise LidarError(f"`{name}` requires `out`, the folder of the reconstruction.")
-        return
-    replaces = overwrite or (resume and Work.is_unfinished(Path(out)))
-    check_not_existing([Path(out) / SCENARIO_FILE], overwrite=replaces)
+    if out is not None:
+        check_new_result(
+            Path(out), [SCENARIO_FILE], resume=resume, restart=restart, overwrite=overwrite
+        )
+    elif resume or restart or overwrite:
+        name = "resume" if resume else "restart" if restart else "overwrite"
+        raise LidarError(f"`{name}` requires `out`, the folder of the reconstruction.")
 
 
 def _check_sweeps(recorded: RecordedSweeps) -> None:
@@ -336,11 +334,6 @@ class _Building:
             return poses, recorded.vehicle, recorded.isolated
 
         poses, vehicle, isolated = self.work.once(_POSES, find)
-        poses = poses._replace(
-            source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
-        )
-        vehicle = vehicle._replace(share=float(vehicle.share))
-        isolated = IsolatedRanges(*map(float, isolated))
         return poses, replace(self.recorded, vehicle=vehicle, isolated=isolated)
 
     def _align_submaps(

@@ -35,6 +35,7 @@ def move_into_place(
     last: str,
     remove: Iterable[str] = (),
     outdated: Iterable[str] = (),
+    merge: bool = False,
     on_written: Callable[[], object] = lambda: None,
 ) -> None:
     """Move all files and folders in a staging folder to the folder or storage of the result.
@@ -58,12 +59,16 @@ def move_into_place(
         Further files and folders of an earlier result to remove.
     outdated
         Further files that mark a complete result, and are removed before it changes.
+    merge
+        Whether to keep the other files of folders with the same names. Folders that have become
+        empty are removed.
     on_written
         Function that is called when all files are in place, before a pending interrupt is raised.
     """
     storage = Storage.at(target)
+    paths = filter(Path.is_file, staged.rglob("*")) if merge else staged.iterdir()
     names = sorted(
-        (path.name for path in staged.iterdir() if path.name != last),
+        {path.relative_to(staged).as_posix() for path in paths} - {last},
         key=lambda name: (name.endswith(".html"), name),
     )
     existing = storage.entries()
@@ -88,9 +93,12 @@ def move_into_place(
             _flush(storage)  # a crash must not leave an earlier `last` beside other changes
         for name in obsolete:
             discard(name)
+        if merge:
+            storage.prune(obsolete)
         for name in names:
             move(name)
-        _flush(storage)
+        for parent in {parent for name in names for parent in Path(name).parents}:
+            _flush(storage, parent)
         move(last)
         _flush(storage)  # makes the moves durable before anything else is removed
         on_written()
@@ -116,8 +124,12 @@ def _prepared(staged: Path, storage: Storage, last: str) -> Iterator[Callable[[s
     if storage.is_local:
         for path in staged.rglob("*"):
             flush(path)
-        folder = storage.local()
-        yield lambda name: (staged / name).replace(folder / name)
+
+        def move(name: str) -> None:
+            storage.prepare(Path(name).parent)
+            (staged / name).replace(storage.local() / name)
+
+        yield move
         return
     uploaded = f"{WRITING}{last}-{secrets.token_hex(4)}"
 
@@ -137,6 +149,6 @@ def _prepared(staged: Path, storage: Storage, last: str) -> Iterator[Callable[[s
             storage.discard(uploaded)
 
 
-def _flush(storage: Storage) -> None:
+def _flush(storage: Storage, folder: str | Path = "") -> None:
     if storage.is_local:
-        flush(storage.local())
+        flush(storage.local(folder))

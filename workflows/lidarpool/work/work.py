@@ -82,7 +82,7 @@ class Step(NamedTuple):
         Name of the step, which is the name of a folder.
     kinds
         Types of the records that the step returns for an item: NamedTuples or dataclasses whose
-        fields are arrays or None.
+        fields are arrays, numbers, strings or None.
     """
 
     name: str
@@ -319,7 +319,9 @@ class Work:
             ) from error
 
     @contextmanager
-    def publishing(self, last: str, remove: Sequence[str] = ()) -> Iterator[Path]:
+    def publishing(
+        self, last: str, remove: Iterable[str] = (), *, merge: bool = False
+    ) -> Iterator[Path]:
         """Yield a folder for the files of the result, and then move them to the target.
 
         The work is removed when all files are in place. See `move_into_place`.
@@ -337,7 +339,12 @@ class Work:
                 yield staged
                 self._check_unchanged()
                 move_into_place(
-                    staged, self.target, last=last, remove=remove, on_written=self._remove
+                    staged,
+                    self.target,
+                    last=last,
+                    remove=remove,
+                    merge=merge,
+                    on_written=self._remove,
                 )
         except LidarError as error:
             raise LidarError(str(error).replace(str(staged), str(self.target))) from error
@@ -494,6 +501,14 @@ def _closing(results: Iterable[Any]) -> Iterator[Iterable[Any]]:
             close()
 
 
+def link_files(files: Mapping[str, Path], folder: Path) -> None:
+    """Create files of a `FileStep` in a folder, as hard links if the file system supports them."""
+    target = Storage.at(folder, durable=False)
+    for name, path in files.items():
+        target.prepare(Path(name).parent)
+        target.copy_from(Storage.at(path.parent), path.name, name)
+
+
 def _pack_result(step: Step | FileStep, result: Any) -> dict[str, bytes]:
     if isinstance(step, FileStep):
         return dict(result)
@@ -511,7 +526,12 @@ def _pack(record: Any) -> bytes:
 
 def _unpack(kind: type, data: bytes) -> Any:
     with np.load(io.BytesIO(data)) as arrays:
-        return kind(**{name: arrays.get(name) for name in _field_names(kind)})
+        return kind(**{name: _unpack_value(arrays.get(name)) for name in _field_names(kind)})
+
+
+def _unpack_value(array: Any) -> Any:
+    """Return an array, or the number or string that an array without dimensions contains."""
+    return array if array is None or array.ndim else array.item()
 
 
 def _field_names(kind: type) -> list[str]:
