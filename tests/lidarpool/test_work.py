@@ -15,6 +15,7 @@ from lidarpool.work import publishing
 from lidarpool.work.publishing import move_into_place
 from lidarpool.work.work import FOLDER, FileStep, Inputs, Step, Work, link_files
 from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +206,66 @@ def test_changed_inputs_are_named(sums, monkeypatch):
     sums.source.write_text("[2, 3, 5]")
     with pytest.raises(LidarError, match=r"different inputs \(numbers\)\. Repeat the original"):
         sums.run(resume=True)
+
+
+def test_files_in_linked_folders_are_inputs(tmp_path):
+    data = tmp_path / "data" / "sweeps"
+    data.mkdir(parents=True)
+    (data / "1.pcd").write_text("points")
+    recording = tmp_path / "recording"
+    recording.mkdir()
+    (recording / "sweeps").symlink_to(data)
+    (recording / "round").symlink_to(recording)
+    first = Inputs({"recording": recording}, {}).identity()
+    assert Inputs({"recording": recording}, {}).identity() == first
+    (data / "1.pcd").write_text("more points")
+    assert Inputs({"recording": recording}, {}).identity() != first
+
+
+@pytest.mark.parametrize("is_accessible", [True, False])
+@pytest.mark.parametrize(("chunk", "sizes"), [(1, [1] * 5), (2, [2, 2, 1]), (9, [5])])
+def test_processes_store_results_if_they_can(chunk, sizes, is_accessible, tmp_path, monkeypatch):
+    returned = []
+
+    def run(function, tasks):
+        for task in tasks:
+            returned.append(function(task))
+            yield returned[-1]
+
+    if not is_accessible:
+        monkeypatch.setattr(Storage, "has_content", lambda *arguments: False)
+    with Work.open(tmp_path, Inputs({}, {"options": 1}), noun="sum") as work:
+        parts = work.each(SQUARE, run, square, range(5), chunk=chunk)
+        assert [int(part.values[0]) for part, _ in parts] == [0, 1, 4, 9, 16]
+    assert [len(results) for results in returned] == sizes
+    are_returned = [result is not None for results in returned for result in results]
+    assert are_returned == [not is_accessible] * 5
+
+
+def test_files_are_stored_under_their_keys(tmp_path):
+    step = FileStep("encode")
+    calls = []
+
+    def encode(name):
+        calls.append(name)
+        return {f"sweeps/{name}.bin": name.encode(), "details": b"{}"}
+
+    with Work.open(tmp_path, Inputs({}, {"options": 1}), noun="sum") as work:
+        keys = ["0/a", "0/b", "1/a"]
+        stored = [*work.each(step, map, encode, ["x", "y", "z"], keys)]
+        folder = tmp_path / FOLDER / "encode"
+        assert work.folder(step) == folder
+        assert [*stored[1]] == ["sweeps/y.bin", "details"]
+        assert stored[1]["sweeps/y.bin"] == folder / "0" / "b" / "sweeps" / "y.bin"
+        assert work.count(step) == 3
+        stored[0]["details"].write_bytes(b"[]")  # damaged
+        assert work.find(step, "0/a") is None
+        assert [*work.each(step, map, encode, ["x", "y", "z"], keys)] == stored
+        assert calls == ["x", "y", "z", "x"]
+        assert stored[0]["details"].read_bytes() == b"{}"
+        work.forget(step, "0")
+        assert work.count(step) == 1
+        assert [path.name for path in folder.iterdir()] == ["1"]
 
 
 def test_inputs_that_change_during_the_work_are_refused_before_anything_is_published(

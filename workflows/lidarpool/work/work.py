@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import secrets
 import shutil
 import zipfile
@@ -63,14 +64,29 @@ class Inputs:
 
 
 def fingerprint_files(path: Path) -> str:
-    """Return a hash of the names, sizes and modification times of a file or of all in a folder."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    """Return a hash of the names, sizes and modification times of a file or of all in a folder.
+
+    Symbolic links are followed.
+    """
+    files = sorted(_files_below(path)) if path.is_dir() else [path]
     states = [
         (str(file.relative_to(path)), status.st_size, status.st_mtime_ns)
         for file in files
         if file.is_file() and (status := file.stat())
     ]
     return fingerprint(str(path.absolute()), states)
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    visited = set[str]()  # links may lead to a folder that contains them
+    for current, folders, names in os.walk(folder, followlinks=True):
+        resolved = os.path.realpath(current)
+        if resolved in visited:
+            folders.clear()
+            continue
+        visited.add(resolved)
+        folders.sort()
+        yield from (Path(current, name) for name in names)
 
 
 class Step(NamedTuple):
