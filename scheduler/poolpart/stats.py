@@ -11,7 +11,7 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
@@ -38,6 +38,36 @@ _WAITING = {
 }
 
 
+class _EndedTask(NamedTuple):
+    """Finished task, from which a table row is only created on request, to save time."""
+
+    state: str  # according to Dask
+    key: Any
+    function: str
+    worker: Any  # name of the worker, or None
+    slots: int
+    queued: float | None  # times in seconds since 1970
+    started: float | None
+    finished: float | None
+    error: str | None
+
+    def to_row(self) -> TaskRow:
+        started = to_datetime(self.started)
+        finished = to_datetime(self.finished)
+        return TaskRow(
+            state="done" if self.state == "memory" else "failed",
+            key=str(self.key),
+            function=self.function,
+            worker="" if self.worker is None else str(self.worker),
+            slots=self.slots,
+            queued=to_datetime(self.queued),
+            started=started,
+            finished=finished,
+            error=" ".join((self.error or "").split())[:_ERROR_LETTERS],
+            seconds=(finished - started).total_seconds() if started and finished else None,
+        )
+
+
 class TaskStatistics(SchedulerPlugin):
     """Scheduler plugin that counts the tasks that finish after its creation."""
 
@@ -51,7 +81,9 @@ class TaskStatistics(SchedulerPlugin):
         # {(partition, stage): totals of finished tasks, by field of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         # {partition: finished tasks, newest first}
-        self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=MAX_ENDED_TASKS))
+        self.recent: dict[str, deque[_EndedTask]] = defaultdict(
+            lambda: deque(maxlen=MAX_ENDED_TASKS)
+        )
         self._runnable: dict[Any, float] = {}  # {task key: time when its inputs were available}
         self._deaths: dict[Any, int] = {}  # {task key: workers that died while it was assigned}
         for feature in FEATURES:
@@ -111,24 +143,20 @@ class TaskStatistics(SchedulerPlugin):
         computing: list[Any],
         report: Mapping[str, Any],
     ) -> None:
-        """Add a table row for a finished task, given the `report` of its worker."""
+        """Keep what a table shows of a finished task, given the `report` of its worker."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
-        started = to_datetime(computing[0]["start"] if computing else None)
-        finished = to_datetime(computing[-1]["stop"] if computing else None)
-        seconds = (finished - started).total_seconds() if started and finished else None
         self.recent[partition].appendleft(
-            TaskRow(
-                state="done" if finish == "memory" else "failed",
-                key=str(task.key),
-                function=task.prefix.name,
-                worker="" if worker is None else str(worker.name),
-                slots=_slots_taken(task, partition),
-                queued=to_datetime(runnable),
-                started=started,
-                finished=finished,
-                error=" ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
-                seconds=seconds,
+            _EndedTask(
+                finish,
+                task.key,
+                task.prefix.name,
+                None if worker is None else worker.name,
+                _slots_taken(task, partition),
+                runnable,
+                computing[0]["start"] if computing else None,
+                computing[-1]["stop"] if computing else None,
+                report.get("exception_text"),
             )
         )
 
@@ -226,7 +254,8 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
                 seconds=seconds,
             )
         )
-    return [*rows, *statistics.recent.get(name, ())], statistics.since
+    rows += [task.to_row() for task in statistics.recent.get(name, ())]
+    return rows, statistics.since
 
 
 def _times_of_running(task: Any) -> tuple[float | None, float | None]:
