@@ -13,6 +13,7 @@ from benchmarks import (
     formats,
     gpu,
     model,
+    pipelines,
     scale,
     submitting,
 )
@@ -76,6 +77,17 @@ def test_beside_dask(tmp_path, capsys):
     assert rows.keys() == small | wide | short
     assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
     assert capsys.readouterr().out.count("µs, Dask") == 20
+
+
+def test_pipelines(tmp_path, capsys):
+    path = tmp_path / "rounds.json"
+    options = ["--quick", "--only", "dask", "poolpart", "poolpart_own", "--json", str(path)]
+    medians = pipelines.main(options)
+    assert {program: [medians[program]] for program in medians} == read_results(path)
+    assert all(result["throughput"] > 0 and result["wait_s"] > 0 for result in medians.values())
+    for program in ("dask", "poolpart"):
+        assert not medians[program]["kill_wrong"] and not medians[program]["kill_error"]
+    assert "| lines of code | 20 | 14 | 14 |" in capsys.readouterr().out
 
 
 def test_bytes_of_batches(capsys):
