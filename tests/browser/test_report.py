@@ -23,6 +23,8 @@ CUT = """[...document.querySelectorAll('body, .scroll, table, tr, td, th, dd, dt
   .map((e) => `${e.tagName} ${e.textContent.trim().slice(0, 60)}`)"""
 
 
+HIDDEN_IN_CHARTS = """[...document.querySelectorAll('.chart .picture-margin')]
+  .filter((e) => getComputedStyle(e).display === 'none').length"""
 WIDE = re.compile(r'<table class="wide">.*?</table>', re.DOTALL)
 
 
@@ -51,6 +53,7 @@ def test_no_number_or_label_is_cut_off(new_tab, tmp_path):
                 tab.wait_for(lambda text: "Nearest" in text or "Sensor and scene" in text)
                 assert tab.value(CUT) == [], (name, size)
                 assert tab.value("document.documentElement.scrollWidth") <= size[0]
+                assert tab.value(HIDDEN_IN_CHARTS) == 0, "charts keep their titles and legends"
 
 
 # What of a picture lies beside the screen, is too small to read, or covers other text.

@@ -623,3 +623,11 @@ def test_title_and_legend_are_also_text_around_the_drawing(scene, shot):
     classes = [element.get("class") for element in drawing.iter("g") if element.get("class")]
     assert classes.count("picture-margin") == 4  # title, details, color bar and legend
     assert classes.count("picture-label") >= 9  # three axes
+
+
+def test_labels_of_a_map_are_enlarged_on_small_screens(planned):
+    text = draw_path(planned, planned.best, np.zeros(2), (1600, 1000)).html()
+    drawing = html.fromstring(f"<main>{text}</main>")[1]
+    classes = [element.get("class") for element in drawing.iter("g") if element.get("class")]
+    assert classes.count("picture-label") >= 12  # two titles and the ticks of two axes
+    assert {"picture-label-left", "picture-label-right"} <= {*classes}  # start and target

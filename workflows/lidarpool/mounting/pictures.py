@@ -37,6 +37,7 @@ _LABEL_SIDES = (
     (-3, -3, "right", "top"),
 )
 MAX_PANELS = 6  # maximum number of candidates or target classes on a page
+MAPS = ("blind", "redundancy")  # pictures of a single map with a legend
 _SIZE = (1600, 1200)
 # Layout of pages with several charts, pixels.
 _LEFT = 80

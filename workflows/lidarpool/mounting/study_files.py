@@ -108,10 +108,12 @@ def write_study(result: MountRanking, staged: Path, folder: Path) -> None:
     for name, mesh in meshes.items():
         (staged / name).parent.mkdir(exist_ok=True)
         write_scene(staged / name, Scene.from_meshes([mesh]))
-    from .pictures import draw_all  # imports Matplotlib
+    from .pictures import MAPS, draw_all  # imports Matplotlib
 
     figures = figures_of(result)
-    pictures = {name: page.svg() for name, page in draw_all(result).items()}
+    pictures = {
+        name: page.html() if name in MAPS else page.svg() for name, page in draw_all(result).items()
+    }
     report = figures | {"versions": {"lidarpool": __version__}, "name": _title(result)}
     mounts = [
         (candidate["name"], name, mount)

@@ -331,8 +331,6 @@ class Page:
             ticks = make_axis(name, lower, upper, step, float(start))
             side.set_ticks(ticks.ticks, ticks.labels)
             side.set_label_text(ticks.title)
-            for label in (side.label, *side.get_ticklabels()):
-                label.set_gid(LABEL)
         return axes
 
     def title(self, text: str, *details: str) -> None:
@@ -517,6 +515,11 @@ class Page:
         The title and the legend are also in the drawing. A style sheet shows either these, or on
         small screens the elements around the drawing, whose text is as large as that of the page.
         """
+        for axes in self.figure.axes:
+            sides = () if axes.get_gid() == _MARGIN else (axes.xaxis, axes.yaxis)
+            labels = [label for side in sides for label in (side.label, *side.get_ticklabels())]
+            for label in [*labels, *axes.texts]:
+                label.set_gid(label.get_gid() or LABEL)
         keys = _use_page_colors("".join(self._keys))
         return (
             f'<div class="picture-title">{self._headline}</div>{self.svg()}'
