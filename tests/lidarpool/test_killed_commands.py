@@ -30,6 +30,7 @@ from lidarpool.comparing.fit import charts, fitting
 from lidarpool.mounting import pictures
 from lidarpool.mounting.evaluation import MountEvaluator, MountResult
 from lidarpool.mounting.study_files import rank_mounts
+from lidarpool.occupancy import writing
 from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
@@ -38,6 +39,7 @@ from lidarpool.work import publishing, work
 from lidarpool.work.work import FOLDER, Step
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
+from lidarsim.simulator.occupancy import VoxelGrid
 
 # Names of files and folders that are not part of a result.
 UNFINISHED = (FOLDER, TEMPORARY, WRITING)
@@ -236,6 +238,43 @@ class MountUser(User):
         rank_mounts(file, outputs / "out", workers=1, resume=resume, overwrite=True)
 
 
+STREET = """
+scene: {{copies: [{{name: House, box: [1, 4, 2], at: [[{version}, 1, 0]]}}]}}
+sensor: {{rays_per_revolution: 36, layers: 5, vertical_fov_deg: 30, step_deg: 90}}
+trajectory: {{points: [{{time_s: 0, position: [0, 0, 0]}}, {{time_s: 0.6, position: [1, 0, 0]}}]}}
+"""
+
+
+class OccupancyUser(User):
+    """Grids that are added to a folder with those of another sensor."""
+
+    last = "out/occupancy.json"
+    resumes = True
+    source = "2.yaml"
+    noun = "scenario"
+    other = "out/sequences/01/voxels/000000.bin"
+
+    def prepare(self, folder, patches):
+        for version in (1, 2):
+            (folder / f"{version}.yaml").write_text(STREET.format(version=version))
+        patches.setattr(writing, "_compute_files", cache(writing._compute_files))
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        if not (outputs / self.other).exists():
+            (outputs / self.other).parent.mkdir(parents=True)
+            (outputs / self.other).write_text("of another sensor")
+        grid = VoxelGrid((0, -2, -2), (4, 2, 2), 1)
+        settings = writing.OccupancySettings("semantickitti", grid, backend="numpy")
+        writing.write_occupancy(
+            inputs / f"{version}.yaml",
+            outputs / "out",
+            settings,
+            workers=1,
+            resume=resume,
+            overwrite=True,
+        )
+
+
 class CompareUser(User):
     last = "out/compare.json"
 
@@ -314,6 +353,7 @@ USERS: dict[str, Callable[[], User]] = {
     "augment, file": AugmentFileUser,
     "augment, campaign": AugmentCampaignUser,
     "mount": MountUser,
+    "occupancy": OccupancyUser,
     "compare": CompareUser,
     "fit": FitUser,
     "plot": PlotUser,
@@ -489,7 +529,7 @@ def test_an_interrupted_command_states_how_to_continue(command, on_stored):
         LidarError, match=r"an unfinished \w+\. Continue it with `--resume`, or rem"
     ):
         command.run(2)
-    with pytest.raises(LidarError, match=r"an unfinished \w+ with different inputs \(\w+\)"):
+    with pytest.raises(LidarError, match=r"an unfinished \w+ with different inputs \([\w ]+\)"):
         command.run(1, resume=True)
     command.run(2, resume=True)
     assert files(command.outputs) == command.new

@@ -88,6 +88,7 @@ def _parse_extent(text: str) -> Corners:
 @options.backend
 @options.scheduler
 @options.workers
+@options.unfinished("computation")
 @overwrite
 @options.flag("--quiet", "-q", help="Do not show progress.")
 @options.as_json
@@ -106,6 +107,8 @@ def occupancy(
     scheduler: str | None,
     files: TlsFiles,
     workers: int | None,
+    resume: bool,
+    restart: bool,
     overwrite: bool,
     quiet: bool,
     as_json: bool,
@@ -128,10 +131,10 @@ def occupancy(
       lidarpool occupancy campaign.yaml --layout occ3d --out grids --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - Click requires the character \b
     options.check_workers(workers, scheduler)
+    options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the scene", quiet=quiet or as_json)
     from lidarsim.simulator.occupancy import VoxelGrid
 
-    from ..clouds.folder import result_folder
     from ..occupancy.layouts import LAYOUTS
     from ..occupancy.writing import OccupancySettings, write_occupancy
     from ..processes.freed_memory import keep_freed_memory
@@ -152,7 +155,6 @@ def occupancy(
     )
     client = nullcontext() if scheduler is None else connect_client(scheduler, files)
     with (
-        result_folder(out),
         client as connected,
         terminal.writing("computing the grids") as show,
     ):
@@ -163,6 +165,8 @@ def occupancy(
             job=job,
             client=connected,
             workers=workers,
+            resume=resume,
+            restart=restart,
             overwrite=overwrite,
             progress=lambda done, total: show("occupancy", done, total, "sweeps"),
         )

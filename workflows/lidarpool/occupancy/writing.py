@@ -11,21 +11,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import TEMPORARY
 from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGrid
 from lidarsim.words import join_names
 
 from ..clouds.cloud_format import Entry
-from ..clouds.folder import check_not_existing
+from ..clouds.folder import check_new_result, check_not_existing, result_folder
+from ..identity.fingerprint import fingerprint
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from ..work.mapping import describe_sweeps, parallel_map
+from ..work.work import FileStep, Inputs, Work, link_files
 from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 INFO_FILE = "occupancy.json"
 _TASK_SWEEPS = 4
 _WORKER_BYTES = 2 << 30
+_GRIDS = FileStep("grids")
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,13 @@ class _OpenJob:
         entry = None if self.number is None else Entry(job.number, job.name, job.split, job.values)
         return LAYOUTS[self.settings.layout](job.sweeps, entry, self.sensor)
 
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What the files depend on, in addition to the settings."""
+        job = self.job
+        entry = (job.number, job.name, job.split, dict(job.values))
+        return fingerprint(job.scene), fingerprint(job.survey), entry, self.backend
+
     @cached_property
     def simulator(self) -> OccupancySimulator:
         """Simulator of the grids."""
@@ -191,6 +200,8 @@ def write_occupancy(
     job: int | None = None,
     client: Client | None = None,
     workers: int | None = None,
+    resume: bool = False,
+    restart: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> WrittenOccupancy:
@@ -201,7 +212,8 @@ def write_occupancy(
     path
         Scenario or campaign file.
     out
-        Output folder.
+        Output folder. Finished grids are kept in it until all of them are written. Files of other
+        jobs and sensors remain.
     settings
         Layout, grid and sensor.
     job
@@ -211,6 +223,10 @@ def write_occupancy(
         processes on this machine compute the grids.
     workers
         Number of processes on this machine. The files do not depend on it.
+    resume
+        Whether to continue an unfinished computation in the folder.
+    restart
+        Whether to remove an unfinished computation in the folder.
     overwrite
         Whether to replace existing files.
     progress
@@ -219,40 +235,56 @@ def write_occupancy(
     Raises
     ------
     LidarError
-        If the scenario cannot be read, or if files exist or cannot be written.
+        If the scenario cannot be read, if files exist or cannot be written, if the folder contains
+        an unfinished computation that is neither resumed nor removed, or if the cluster is lost.
     """
     path = path.absolute()
     numbers = _job_numbers(path, job)
     info = _info(settings)
-    if not overwrite:
+    check_new_result(out, (), resume=resume, restart=restart, overwrite=overwrite)
+    replaces = overwrite or (resume and Work.is_unfinished(out))
+    if not replaces:
         _check_same_grid(out / INFO_FILE, info)
         _check_first_files(out, settings, numbers)
     notes: dict[str, None] = {}
     tasks: list[_Task] = []
+    jobs: list[Any] = []
     for number in numbers:
-        layout = _open_job(path, number, settings).layout
+        opened = _open_job(path, number, settings)
+        layout = opened.layout
         notes |= dict.fromkeys(layout.notes())
         names = (name for sample in range(layout.count) for name in layout.paths(sample))
-        check_not_existing((out / name for name in names), overwrite=overwrite)
+        check_not_existing((out / name for name in names), overwrite=replaces)
+        jobs.append(opened.identity)
         tasks += [
             _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
             for first in range(0, layout.count, _TASK_SWEEPS)
         ]
+    inputs = _inputs(path, settings, jobs)
     total = sum(len(task.sweeps) for task in tasks)
     done = 0
-    file_count = 0
+    files: dict[str, Path] = {}
     with (
-        parallel_map(client, len(tasks), _WORKER_BYTES, workers) as run,
-        explain_os_errors(f"The grids cannot be written to {out}", "free some disk space"),
+        result_folder(out),
+        Work.open(out, inputs, noun="computation", resume=resume, restart=restart) as work,
     ):
-        for task, files in zip(tasks, run(_compute_files, tasks), strict=True):
-            for name, content in files.items():
-                _write(out / name, content)
-            file_count += len(files)
-            done += len(task.sweeps)
-            progress(done, total)
-        _write(out / INFO_FILE, info)
-    return WrittenOccupancy(len(numbers), total, file_count, tuple(notes))
+        with parallel_map(client, len(tasks), _WORKER_BYTES, workers) as run:
+            results = work.each(_GRIDS, run, _compute_files, tasks)
+            for task, found in zip(tasks, results, strict=True):
+                files |= found
+                done += len(task.sweeps)
+                progress(done, total)
+        with work.publishing(INFO_FILE, merge=True) as staged:
+            link_files(files, staged)
+            (staged / INFO_FILE).write_bytes(info)
+    return WrittenOccupancy(len(numbers), total, len(files), tuple(notes))
+
+
+def _inputs(path: Path, settings: OccupancySettings, jobs: Sequence[Any]) -> Inputs:
+    """Return what the files depend on. Workers read the files of the scenario again."""
+    source = CampaignSpec if is_campaign(path) else Scenario
+    files = {str(file): file for file in sorted(source.load(path).files)}
+    return Inputs({"scenario": path, **files}, {"jobs": jobs, "options": settings})
 
 
 def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
@@ -269,14 +301,6 @@ def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
             f"Job {job} does not exist. The jobs of the campaign are 0 to {len(numbers) - 1}."
         )
     return [job]
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file atomically, creating its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{TEMPORARY}{path.name}")
-    temporary.write_bytes(content)
-    temporary.replace(path)
 
 
 def _check_same_grid(file: Path, info: bytes) -> None:
