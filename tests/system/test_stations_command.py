@@ -74,7 +74,7 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
 
     # The same again, as JSON, and in place of the first.
     again = lidarpool(*arguments, "--json")
-    assert again.code == 2 and "stations.yaml already exists. Use another folder" in again.err
+    assert again.code == 2 and "stations.yaml already exists. Use another output" in again.err
     told = json.loads(lidarpool(*arguments, "--json", "--overwrite").out)
     stations = [tuple(one["position"]) for one in told["stations"]]
     assert [pose.position for pose in Scenario.load(folder / "stations.yaml").poses] == stations

@@ -362,17 +362,16 @@ def _write_plan(
 
     `data` is the content of the scenario, and `notes` are written to its head.
     """
-    from lidarsim.io.storage import staging
-
     from ..plan.flight_density import expected_density, summarize_density
     from ..plan.flight_files import to_geojson, to_kml
     from ..report.flight_map import draw_flight
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
+    from ..work.publishing import publishing
 
     with (
         explain_os_errors(f"The plan cannot be written to {folder}", "free some disk space"),
-        staging(folder) as staged,
+        publishing(folder / SCENARIO_FILE, remove=() if site.epsg else [KML_FILE]) as staged,
     ):
         (staged / PATH_FILE).write_text(_path_text(plan), "ascii", newline="\n")
         source = "plan" if site.scenario is None else site.scenario.source
@@ -394,10 +393,6 @@ def _write_plan(
             (staged / KML_FILE).write_text(kml, "utf-8", newline="\n")
         with terminal.status("drawing the map"):
             draw_flight(plan, expected).save(staged / PICTURE_FILE)
-        for name in FILES:
-            (folder / name).unlink(missing_ok=True)
-            if (staged / name).exists():
-                (staged / name).replace(folder / name)
     return density
 
 

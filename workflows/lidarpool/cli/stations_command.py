@@ -199,10 +199,9 @@ def _plan(
     scenario: Scenario, model: str | None, folder: Path, as_json: bool, **settings: Any
 ) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
-    from lidarsim.io.storage import staging
-
     from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
+    from ..work.publishing import publishing
     from .terminal import Terminal
 
     sensor, entry = _planned_sensor(scenario, model, folder)
@@ -220,13 +219,11 @@ def _plan(
     text = _stations_scenario(sections | {"sensor": entry}, plan, settings["targets"], remarks)
     with (
         explain_os_errors(f"The stations cannot be written to {folder}", "free some disk space"),
-        staging(folder) as staged,
+        publishing(folder / PLAN_FILE) as staged,
     ):
         (staged / PLAN_FILE).write_text(text, "utf-8", newline="\n")
         with terminal.status("drawing the picture"):
             draw_stations(plan).save(staged / PICTURE_FILE)
-        for name in (PLAN_FILE, PICTURE_FILE):
-            (staged / name).replace(folder / name)
     shortfalls = [*omissions, *_shortfalls(plan, settings["count"], settings["coverage"])]
     if settings["targets"]:
         shortfalls += _unreachable_notes(prepared.scene.names, plan, "candidate positions")
