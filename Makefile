@@ -62,6 +62,7 @@ chaos: dev  ## 200 faults at every point of a survey, and damage of files; SEED=
 	$(BIN)/python -m tests.chaos.damage --count 3 --seconds 60 $(if $(SEED),--seed $(SEED))
 	$(BIN)/python -m tests.chaos.local_runs --faults 24 $(if $(SEED),--seed $(SEED))
 	$(BIN)/python -m tests.chaos.balancing --faults 60 $(if $(SEED),--seed $(SEED))
+	$(BIN)/python -m tests.chaos.sharing --faults 50 $(if $(SEED),--seed $(SEED))
 
 mutants: dev  ## COUNT faults planted in the sources (default 20), and which of them no test notices; SEED=n draws them again
 	$(BIN)/python -m tests.mutants --count $(or $(COUNT),20) $(if $(SEED),--seed $(SEED)) $(PACKAGES)

@@ -200,6 +200,26 @@ def _own_resources(dask_worker: Any) -> dict[str, float]:
     return dict(dask_worker.state.total_resources)
 
 
+def send_signal(pid: int | None, number: signal.Signals) -> None:
+    """Send a signal to a process, unless it has ended."""
+    with suppress(ProcessLookupError):
+        if pid is not None:
+            os.kill(pid, number)
+
+
+def pause_for(client: Client, address: str | None, seconds: float) -> None:
+    """Pause a worker for some time, as Dask does if memory is short."""
+
+    def pause_at(fraction: float, dask_worker: Any) -> None:
+        dask_worker.memory_manager.memory_pause_fraction = fraction
+
+    for fraction in (1e-9, 0.8):
+        with suppress(OSError, ValueError):  # it died by another fault
+            client.run(pause_at, fraction, workers=[address], on_error="ignore")
+        if fraction < 0.8:
+            time.sleep(seconds)
+
+
 class Run:
     """A pass of all items through the pipeline, during which faults are injected."""
 
@@ -262,41 +282,24 @@ class Run:
         self.done[kind] += 1
 
     def _kill(self, name: str, _: float) -> None:
-        self._send(self.arena.pid(name), signal.SIGKILL)
+        send_signal(self.arena.pid(name), signal.SIGKILL)
 
     def _stop(self, name: str, seconds: float) -> None:
         pid = self.arena.pid(name)
-        self._send(pid, signal.SIGSTOP)
+        send_signal(pid, signal.SIGSTOP)
         self._start(self._wake, pid, seconds)
         if seconds < sum(STOPPED_S) / 2:
             self._start(self.arena.give_up, pid)
 
     def _wake(self, pid: int | None, seconds: float) -> None:
         time.sleep(seconds)
-        self._send(pid, signal.SIGCONT)
+        send_signal(pid, signal.SIGCONT)
 
     def _pause(self, name: str, seconds: float) -> None:
-        self._start(self._pause_for, self.arena.address(name), seconds)
-
-    def _pause_for(self, address: str, seconds: float) -> None:
-        def pause_at(fraction: float, dask_worker: Any) -> None:
-            dask_worker.memory_manager.memory_pause_fraction = fraction
-
-        for fraction in (1e-9, 0.8):
-            with suppress(OSError, ValueError):  # it died by another fault
-                client = self.arena.client
-                client.run(pause_at, fraction, workers=[address], on_error="ignore")
-            if fraction < 0.8:
-                time.sleep(seconds)
+        self._start(pause_for, self.arena.client, self.arena.address(name), seconds)
 
     def _leave(self, name: str, _: float) -> None:
         self.arena.leave(name)
-
-    @staticmethod
-    def _send(pid: int | None, number: signal.Signals) -> None:
-        with suppress(ProcessLookupError):
-            if pid is not None:
-                os.kill(pid, number)
 
     def _start(self, act: Any, *arguments: object) -> None:
         helper = threading.Thread(target=act, args=arguments, name=act.__name__, daemon=True)
