@@ -162,8 +162,11 @@ def _noticed(place: Place, lines: Lines, fault: Fault, groups: list[list[str]]) 
     tried = 0
     for group in [] if fault.compiled else groups:
         tried += len(group)
-        noticed = place.forks.failure(fault, group, _limit_s(lines, group))
-        if noticed:
+        limit_s = _limit_s(lines, group)
+        noticed = place.forks.failure(fault, group, limit_s)
+        if noticed == "hangs" and place.forks.failure(None, group, limit_s) == noticed:
+            print(f"skipped, because they hang without a fault: {' '.join(group)}", flush=True)
+        elif noticed:
             return noticed, tried
     tests = [test for group in groups for test in group]
     if not tests:
