@@ -156,3 +156,14 @@ def test_a_client_whose_tasks_cannot_run_saves_up_no_credit():
         policy.start(number, "a", "f", 1, float(number), passed_over=["b"])
         policy.finish(number, number + 1.0, 1.0)
     assert policy.accounts["b"].tag == pytest.approx(policy.accounts["a"].tag, abs=2.0)
+
+
+def test_the_slots_of_a_client_are_those_of_its_running_tasks():
+    policy = SharePolicy()
+    policy.add_waiting("a", now=0.0, tasks=2)
+    for key, slots in (("x", 1), ("y", 2)):
+        policy.start(key, "a", "f", slots=slots, now=0.0)
+    policy.finish("x", now=1.0, seconds=1.0)
+    assert policy.accounts["a"].slots == 2
+    policy.finish("y", now=1.0, seconds=1.0)
+    assert policy.accounts["a"].slots == 0
