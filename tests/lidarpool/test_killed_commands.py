@@ -197,6 +197,8 @@ class Picture(NamedTuple):
     def svg(self):
         return self.text
 
+    html = svg
+
 
 VEHICLE = """
 body: {{box: [4, 2, 1], at: [0, 0, 0.3]}}
