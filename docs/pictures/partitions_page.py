@@ -2,7 +2,8 @@
 
 `python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a local
 cluster, sends items from a task of the IO partition through a pipe to tasks of the GPU partition,
-and takes a screenshot of the page with Chromium. Local workers stand in for machines with GPUs.
+submits tasks of a second client, and takes a screenshot of the page with Chromium. Local workers
+stand in for machines with GPUs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from docs.pictures.options import file_parser
 from poolpart import Partition, Pipe, PipeFailed, Pool, n_workers, rest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-SIZE = (800, 820)  # pixels
+SIZE = (800, 1010)  # pixels
 CLUSTER = {
     "n_workers": 5,
     "threads_per_worker": 1,
@@ -54,11 +55,12 @@ def index(number: int) -> int:
 
 
 @contextmanager
-def page_at_work(client: Client) -> Iterator[str]:
+def page_at_work(client: Client, other_client: Client) -> Iterator[str]:
     """Divide a cluster, submit tasks to the partitions, and yield the URL of the page."""
     pool = Pool.from_client(client)
     rules = {"GPU": n_workers(2), "IO": n_workers(1), "OTHER": rest()}
-    gpu, io, other = pool.divide(rules).values()
+    gpu, io, _ = pool.divide(rules).values()
+    other = Partition("OTHER", other_client)
     with Pipe("pictures", 8, client) as pipe:
         url = pool.page()
         loading = io.submit(load, pipe, ITEMS)
@@ -70,7 +72,8 @@ def page_at_work(client: Client) -> Iterator[str]:
         yield url
         pipe.fail("the picture is taken")
         shrinking.join()
-        client.cancel([loading, *indexing])
+        client.cancel([loading])
+        other_client.cancel(indexing)
 
 
 def _until_it_fails(gpu: Partition, pipe: Pipe) -> None:
@@ -107,8 +110,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = file_parser(__doc__, ".png").parse_args(arguments)
     with (
         LocalCluster(**CLUSTER) as cluster,
-        Client(cluster) as client,
-        page_at_work(client) as url,
+        Client(cluster, name="alice") as client,
+        Client(cluster, name="bob") as other_client,
+        page_at_work(client, other_client) as url,
     ):
         draw(url, options.file)
     return 0

@@ -69,7 +69,7 @@ h1 + p { margin: 0 0 1.5rem; color: #667; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin-bottom: 2rem; }
 caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
 th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
-td { overflow-wrap: anywhere; }
+td.words { overflow-wrap: anywhere; }
 th { font-weight: 400; color: #667; }
 .words { text-align: left; }
 /* On narrow windows each row is a paragraph: its name, then the names and values of its cells. */
