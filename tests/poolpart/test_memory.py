@@ -36,8 +36,12 @@ def options(**others):
 
 
 @pytest.fixture
-def cluster(start):
-    """Start one worker, which has memory for two tasks of `HALF`; return the client."""
+def cluster(start, monkeypatch):
+    """Start one worker, which has memory for two tasks of `HALF`; return the client.
+
+    Tasks are only assigned after events such as the end of a task, and not by periodic checks.
+    """
+    monkeypatch.setattr("poolpart.shares.CHECK_EVERY_S", 3600.0)
     running.clear()
     highest.clear()
     return start({"w": options()})

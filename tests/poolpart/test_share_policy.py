@@ -1,11 +1,12 @@
 """The policy of fair shares: by values, and in a simulation of 2 and of 126 workers."""
 
+import math
 import random
 
 import pytest
 from tests.poolpart.share_model import SharedPartition, User
 
-from poolpart.share_policy import SharePolicy
+from poolpart.share_policy import RECENT_S, SharePolicy
 
 WEIGHTS = {"a": 1, "b": 1, "c": 3, "d": 1, "e": 1}
 
@@ -117,16 +118,16 @@ def test_lost_workers_change_no_shares():
 def test_a_task_does_not_count_while_it_lends_its_slots():
     policy = SharePolicy()
     for client in "ab":
-        policy.add_waiting(client, 0.0, 2)
-    policy.start("parent", "a", "f", 1, 0.0)
-    policy.lend("parent", 1.0)
-    policy.charge_running(50.0)
-    policy.start("other", "b", "f", 1, 0.0)
-    policy.charge_running(50.0)
+        policy.add_waiting(client, 10.0, 2)
+    policy.start("parent", "a", "f", 1, 10.0)
+    policy.lend("parent", 11.0)
+    policy.charge_running(60.0)
+    policy.start("other", "b", "f", 1, 10.0)
+    policy.charge_running(60.0)
     assert policy.accounts["a"].tag == pytest.approx(1.0)
     assert policy.accounts["b"].tag == pytest.approx(50.0)
-    policy.take_back("parent", 60.0)
-    policy.finish("parent", 62.0, 62.0)
+    policy.take_back("parent", 70.0)
+    policy.finish("parent", 72.0, 62.0)
     assert policy.accounts["a"].seconds == pytest.approx(3.0)
     assert policy.seconds_of("a", "f") == pytest.approx(3.0)
 
@@ -167,3 +168,40 @@ def test_the_slots_of_a_client_are_those_of_its_running_tasks():
     assert policy.accounts["a"].slots == 2
     policy.finish("y", now=1.0, seconds=1.0)
     assert policy.accounts["a"].slots == 0
+
+
+def run_task(policy, client, end, seconds, waited_s=0.0):
+    """Let a client run a task that ends at a time."""
+    policy.add_waiting(client, end - seconds)
+    policy.start("task", client, "f", 1, end - seconds, waited_s)
+    policy.finish("task", end, seconds)
+
+
+def test_the_displayed_share_is_that_of_the_recent_past():
+    policy = SharePolicy()
+    run_task(policy, "a", end=100.0, seconds=10.0)
+    assert policy.share("a", 100.0) == 1.0
+    run_task(policy, "b", end=100.0 + RECENT_S, seconds=10.0)
+    earlier = math.exp(-1)
+    assert policy.share("a", 100.0 + RECENT_S) == pytest.approx(earlier / (1 + earlier))
+    assert policy.share("a", 100.0 + 3 * RECENT_S) == pytest.approx(earlier / (1 + earlier))
+    run_task(policy, "a", end=100.0 + RECENT_S, seconds=10.0)
+    assert policy.share("b", 100.0 + RECENT_S) == pytest.approx(1 / (2 + earlier))
+
+
+def test_running_and_waiting_times_are_moving_averages():
+    policy = SharePolicy()
+    for end, seconds, waited_s in ((10.0, 1.0, 10.0), (20.0, 2.0, 20.0)):
+        run_task(policy, "a", end, seconds, waited_s)
+    assert policy.seconds_of("a", "f") == pytest.approx(1.0 + 0.3 * (2.0 - 1.0))
+    account = policy.accounts["a"]
+    assert account.recent_wait_s == pytest.approx(3.0 + 0.3 * (20.0 - 3.0))
+    assert (account.waited_s, account.seconds) == (30.0, 3.0)
+
+
+def test_after_all_clients_were_idle_they_start_with_the_same_tag():
+    policy = SharePolicy()
+    run_task(policy, "a", end=100.0, seconds=100.0)
+    for client in ("new", "a"):
+        policy.add_waiting(client, 200.0)
+    assert policy.accounts["new"].tag == policy.accounts["a"].tag == pytest.approx(100.0)

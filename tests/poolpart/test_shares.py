@@ -8,10 +8,12 @@ from contextlib import ExitStack
 import dask
 import pytest
 from distributed import Client, Event, wait
-from tests.poolpart.helpers import LONG_S, addresses, kill, metrics_of, wait_for
+from tests.poolpart.helpers import LONG_S, addresses, kill, metrics_of, wait_for, worker_name
 
 from poolpart import Partition, Pool, PoolError, rest
+from poolpart.internals.scheduler import move_task
 from poolpart.membership import request_capacity
+from poolpart.shares import MAX_COMPARED, NAME
 
 ran = []  # names of clients whose tasks have run, in order
 
@@ -138,6 +140,8 @@ def test_the_window_of_a_map_follows_its_share(start):
         time.sleep(0.1)
         stage = alice.stats().stages["wait_for-map"]
         assert stage.running + stage.queued == 4
+        capacity = request_capacity(client, "P", 1, by_rule="")
+        assert (capacity.max_running, capacity.slots, capacity.free) == (2, 2, 0)
         gate.set()
         alone.close()
 
@@ -258,6 +262,83 @@ def test_a_bound_task_waits_on_its_worker_and_leaves_room_for_others(pair, wait_
     for number in range(2, 4):
         Event(f"gate {number}", alice.client).set()
     wait(bound, timeout=LONG_S)
+
+
+def test_a_task_that_was_moved_counts_for_its_new_worker(start, wait_until):
+    client = start({name: {"resources": {"P": 1}} for name in "xy"})
+    scheduler = client.cluster.scheduler
+    client.sync(scheduler.extensions["stealing"].stop)
+    part = Partition("P", client)
+    gate = Event("gate", client)
+    gate.set()
+    client.gather([part.submit(wait_for, gate.name) for _ in range(8)])
+    gate.clear()  # further tasks are expected to be short, so they are assigned in advance
+    futures = [part.submit(wait_for, gate.name) for _ in range(4)]
+    loads = scheduler.plugins[NAME].queues["P"].loads
+    wait_until(lambda: sum(load.used for load in loads.values()) == 4)
+    x, y = (scheduler.workers[client.cluster.workers[name].address] for name in "xy")
+    before = loads[x].used, loads[y].used
+    task = max(x.processing, key=lambda task: task.priority)  # it has not started
+
+    async def move():
+        move_task(scheduler, task, y)
+
+    client.sync(move)
+    wait_until(lambda: (loads[x].used, loads[y].used) == (before[0] - 1, before[1] + 1))
+    gate.set()
+    assert all(client.gather(futures))
+
+
+@pytest.fixture
+def many(start, monkeypatch):
+    """Partition of more workers than are compared for a task. Waiting tasks are not moved."""
+    monkeypatch.setattr("poolpart.extras.watching.LATE_S", 3600.0)
+    workers = {f"w{n}": {"resources": {"P": 1}} for n in range(MAX_COMPARED + 2)}
+    return Partition("P", start(workers))
+
+
+def with_room(part):
+    """Return the addresses of the workers with room, in the order in which they are considered."""
+    queue = part.client.cluster.scheduler.plugins[NAME].queues["P"]
+    return [worker.address for worker in queue.with_room]
+
+
+def test_a_task_runs_where_its_input_is(many):
+    name = many.submit(worker_name)
+    wait(name, timeout=LONG_S)
+    address = addresses(many.client)[name.result()]
+    assert with_room(many).index(address) >= MAX_COMPARED
+    assert many.submit(worker_name, name).result(LONG_S) == name.result()
+
+
+def test_a_free_slot_is_found_behind_many_workers_with_a_task(many, wait_until):
+    scheduler = many.client.cluster.scheduler
+    many.submit(abs, -1).result(LONG_S)
+    *others, free = with_room(many)
+    # A worker with a bound task has room for another task.
+    bound = [many.submit(wait_for, "gate", workers=address) for address in others]
+    wait_until(lambda: all(scheduler.workers[address].processing for address in others))
+    assert with_room(many) == [*others, free]
+    future = many.submit(wait_for, "gate", key="next")
+    wait_until(lambda: "next" in scheduler.tasks and scheduler.tasks["next"].processing_on)
+    assert scheduler.tasks["next"].processing_on.address == free
+    Event("gate", many.client).set()
+    assert all(many.client.gather([*bound, future]))
+
+
+def test_tasks_that_run_before_the_partition_is_used_count(start, wait_until):
+    client = start({"w": {"resources": {"P": 1, "Q": 1}, "nthreads": 2}})
+    [worker] = client.cluster.scheduler.workers.values()
+    options = {"resources": {"P": 1}}, {"resources": {"Q": 1}}
+    futures = [client.submit(wait_for, "gate", pure=False, **option) for option in options]
+    wait_until(lambda: len(worker.processing) == 2)
+    part = Partition("P", client)
+    last = part.submit(abs, -1)
+    await_queued(part, 1)
+    stats = part.stats().clients[client.id]
+    assert (stats.slots, stats.waiting) == (1, 1)
+    Event("gate", client).set()
+    assert client.gather([*futures, last]) == [True, True, 1]
 
 
 @pytest.mark.extended

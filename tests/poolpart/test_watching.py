@@ -11,6 +11,7 @@ from distributed.core import Status
 from tests.poolpart.helpers import LONG_S, set_status, wait_for, worker_name
 
 from poolpart import Partition, Pool, TaskTimeoutError, cancelled
+from poolpart.extras import watching
 
 
 @pytest.fixture
@@ -57,6 +58,36 @@ def test_tasks_do_not_wait_while_another_slot_is_free(start, event, wait_until, 
     wait_until(lambda: all(w.used_resources["A"] == 0 for w in scheduler.workers.values()))
 
 
+@pytest.mark.parametrize("why", ["early", "bound"])
+def test_a_task_stays_on_its_worker_while_another_slot_is_free(
+    start, event, wait_until, monkeypatch, why
+):
+    monkeypatch.setattr(watching, "WATCH_S", 0.05)
+    monkeypatch.setattr(watching, "LATE_S", 3600.0 if why == "early" else 0.0)
+    client = start({"x": {"resources": {"A": 1}}, "y": {"resources": {"A": 1}}})
+    scheduler = client.cluster.scheduler
+    client.sync(scheduler.extensions["stealing"].stop)
+    part = Partition("A", client)
+    release, gate = event(client), event(client)
+    release.set()  # so that tasks are expected to be short, and are assigned in advance
+    client.gather([part.submit(wait_for, release.name) for _ in range(20)])
+    release.clear()
+    x, y = (scheduler.workers[client.cluster.workers[name].address] for name in "xy")
+    running = part.submit(wait_for, gate.name, workers="x")
+    other = part.submit(wait_for, release.name, workers="y")
+    wait_until(lambda: x.processing and y.processing)
+    options = {"workers": "x"} if why == "bound" else {}
+    waiting = [part.submit(wait_for, gate.name, **options) for _ in range(4)]
+    wait_until(lambda: len(x.processing) >= 2)
+    on_x = {task.key for task in x.processing}
+    release.set()
+    wait_until(lambda: other.key not in {task.key for task in y.processing})
+    time.sleep(0.3)  # several checks
+    assert on_x <= {task.key for task in x.processing}
+    gate.set()
+    assert all(client.gather([running, other, *waiting]))
+
+
 def until_cancelled(name):
     while not cancelled():
         time.sleep(0.01)
@@ -68,8 +99,10 @@ def sleep_if_odd(number):
     return number
 
 
-def stop_worker():
+def stop_worker(path):
     """Make the worker unresponsive, as if the function held the interpreter lock."""
+    with path.open("a") as file:
+        file.write("stopped\n")
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
@@ -90,6 +123,27 @@ def test_a_task_that_takes_too_long_fails(client, b, event):
     with pytest.raises(TaskTimeoutError) as caught:
         list(b.map(until_cancelled, [ended.name], timeout_s=0.3))
     assert caught.value.__notes__[0].startswith("poolpart: The error occurred for item 0 of a map")
+
+
+def test_a_question_to_a_worker_ends_only_late_tasks(client, a, event, wait_until):
+    """The scheduler asks a worker if a task may be late according to its last heartbeat."""
+    ended, gate = event(client), event(client)
+    late = a.submit(until_cancelled, ended.name, timeout_s=1.0, workers="A-0")
+    other = a.submit(wait_for, gate.name, timeout_s=3600, workers="A-0")
+    worker = client.cluster.workers["A-0"]
+    state = client.cluster.scheduler.workers[worker.address]
+    wait_until(lambda: len(state.executing) == 2)
+    heartbeat = worker.periodic_callbacks["heartbeat"]
+    client.sync(_call, heartbeat.stop)
+    with pytest.raises(TaskTimeoutError):
+        late.result(LONG_S)
+    client.sync(_call, heartbeat.start)
+    gate.set()
+    assert other.result(LONG_S)
+
+
+async def _call(function):
+    function()
 
 
 @pytest.mark.parametrize("limit", [0, -1, True, "3", float("nan")])
@@ -115,13 +169,15 @@ def test_a_worker_that_does_not_return_is_restarted(nannies, monkeypatch):
 
 
 @pytest.mark.extended
-def test_a_task_that_blocks_its_worker_fails_as_well(nannies, monkeypatch):
+def test_a_task_that_blocks_its_worker_fails_as_well(nannies, monkeypatch, tmp_path):
     monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
     monkeypatch.setattr("poolpart.extras.watching.SILENT_S", 3.0)
     monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
     both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
     with pytest.raises(TaskTimeoutError):
-        both.submit(stop_worker, timeout_s=0.5).result(LONG_S)
+        both.submit(stop_worker, tmp_path / "stopped", timeout_s=0.5).result(LONG_S)
+    # It runs again if no heartbeat has reported it, and then it is known to be the cause.
+    assert len((tmp_path / "stopped").read_text().split()) <= 2
     assert nannies.gather([both.submit(abs, -number) for number in range(9)]) == [*range(9)]
 
 
