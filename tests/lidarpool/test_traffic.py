@@ -29,8 +29,8 @@ from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.casting.surfaces import SceneSurfaces
 from lidarsim.io import allowance
-from lidarsim.simulator.casting.surfaces import SceneSurfaces
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent

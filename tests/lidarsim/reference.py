@@ -20,9 +20,8 @@ from lidarpool import Noise
 from lidarsim.media.weather import Air, Particles
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.random_numbers import Purpose, quantiles
-from lidarsim.sensor.disc import Beam
-from lidarsim.simulator.steps.detection import DETECTION, LOSS
-from lidarsim.simulator.steps.particles import (
+from lidarsim.pulses.steps.detection import DETECTION, LOSS
+from lidarsim.pulses.steps.particles import (
     FOG_CELL,
     FOG_PLACE,
     PARTICLE_DIAMETER,
@@ -30,9 +29,10 @@ from lidarsim.simulator.steps.particles import (
     PARTICLE_SUBRAY,
     PARTICLES,
 )
-from lidarsim.simulator.steps.range_noise import RANGE
-from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
-from lidarsim.simulator.steps.waveform import Digitizer
+from lidarsim.pulses.steps.range_noise import RANGE
+from lidarsim.pulses.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
+from lidarsim.pulses.steps.waveform import Digitizer
+from lidarsim.sensor.disc import Beam
 
 Vector = tuple[float, ...]
 Key = tuple[int, int]  # a scan, and the number of a pulse in it

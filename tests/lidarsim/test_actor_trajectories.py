@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError, Pose, Track
+from lidarsim.casting.actor_trajectories import ActorTrajectories
 from lidarsim.motion.trajectory import Stations
-from lidarsim.simulator.casting.actor_trajectories import ActorTrajectories
 
 
 class Circle:

@@ -12,9 +12,9 @@ from tests.shapes import block, level, wall
 
 from lidarpool import Mounted, Pose, Scene, Sensor, Survey, load_sensor
 from lidarsim import Actor, box
+from lidarsim.casting.actor_visibility import FieldOfView
 from lidarsim.columns.actor_rays import merge_actor_rays
 from lidarsim.motion.trajectory import full_poses
-from lidarsim.simulator.casting.actor_visibility import FieldOfView
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.survey.faults import Fault

@@ -29,8 +29,8 @@ from lidarsim import box as cuboid
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import extinction
 from lidarsim.media.weather import EXIT_M, dust_coefficients, raindrops, snowflakes, spray_clumps
+from lidarsim.pulses.steps.particles import highest_probabilities
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.particles import highest_probabilities
 
 SEEN = Noise(detection_range_m=100)
 THRESHOLD = 0.1 * (10 / 100) ** 2

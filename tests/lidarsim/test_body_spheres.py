@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarsim.casting.motion import CastPoses
 from lidarsim.motion.trajectory import Pose, Track
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.body_spheres import firings_near_bodies, ranges_of_firings
-from lidarsim.simulator.casting.motion import CastPoses
 from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from raybeam import Pattern, RayCaster, SubRays
 

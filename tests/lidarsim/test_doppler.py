@@ -24,11 +24,11 @@ from lidarscenes.robots.robot import Hinge, LinkPath
 from lidarsim import Actor, box
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Stations, velocities
-from lidarsim.simulator.returns import PulseReturns
+from lidarsim.pulses.returns import PulseReturns
+from lidarsim.pulses.steps.false_alarms import FALSE_ALARM
+from lidarsim.pulses.steps.particles import AIR
+from lidarsim.pulses.steps.separation import separate_hits
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
-from lidarsim.simulator.steps.particles import AIR
-from lidarsim.simulator.steps.separation import separate_hits
 
 # of the train
 SPEED = 25.0

@@ -41,12 +41,12 @@ from lidarsim import SceneMesh
 from lidarsim import box as cuboid
 from lidarsim.media.materials import extinction, fresnel
 from lidarsim.numerics.random_numbers import raw
+from lidarsim.pulses.returns import Keys, PulseReturns
+from lidarsim.pulses.steps.angle_noise import ACROSS
+from lidarsim.pulses.steps.range_noise import RANGE
+from lidarsim.pulses.steps.separation import Reporting, reported_mask, separate_hits
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.returns import Keys, PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.angle_noise import ACROSS
-from lidarsim.simulator.steps.range_noise import RANGE
-from lidarsim.simulator.steps.separation import Reporting, reported_mask, separate_hits
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -187,9 +187,9 @@ def test_the_strongest_return_is_that_of_all_detected_returns(subrays, dropout):
 
 def test_a_surface_that_continues_takes_hits_between_its_hits():
     """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
-    from lidarsim.simulator.steps.pulse_loops import SubrayNeighbors
-    from lidarsim.simulator.steps.random_loops import RandomKeys
-    from lidarsim.simulator.steps.separation_loops import (
+    from lidarsim.pulses.steps.pulse_loops import SubrayNeighbors
+    from lidarsim.pulses.steps.random_loops import RandomKeys
+    from lidarsim.pulses.steps.separation_loops import (
         ALL,
         Receiver,
         ReturnArrays,
@@ -366,7 +366,7 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 100)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 

@@ -32,12 +32,12 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.columns.table import SCAN
+from lidarsim.pulses.steps.stray_light import BLOOMING
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.stray_light import BLOOMING
 from raybeam import available_backends, registry
 
 CPU = [name for name in ("numpy", "tiles") if not available_backends()[name]]

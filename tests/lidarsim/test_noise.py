@@ -29,11 +29,11 @@ from lidarpool import (
 from lidarsim.media.weather import Weather, raindrops, snowflakes
 from lidarsim.motion.navigation import gnss_fixes, imu_samples
 from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states
+from lidarsim.pulses.steps import particle_loops, pulse_loops, random_loops, spray_loops
+from lidarsim.pulses.steps.losses import PACKET
+from lidarsim.pulses.steps.range_noise import CHANNEL
+from lidarsim.pulses.steps.waveform_samples import SAMPLE, SAMPLES
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
-from lidarsim.simulator.steps.losses import PACKET
-from lidarsim.simulator.steps.range_noise import CHANNEL
-from lidarsim.simulator.steps.waveform_samples import SAMPLE, SAMPLES
 from raybeam.compiled import compiled
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)

@@ -29,13 +29,13 @@ from lidarpool import (
 from lidarsim import SceneMesh
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.pulses.returns import SURFACE
+from lidarsim.pulses.steps.crosstalk import CROSSTALK
+from lidarsim.pulses.steps.false_alarms import FALSE_ALARM
+from lidarsim.pulses.steps.stray_light import BLOOMING
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
 from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.returns import SURFACE
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.crosstalk import CROSSTALK
-from lidarsim.simulator.steps.false_alarms import FALSE_ALARM
-from lidarsim.simulator.steps.stray_light import BLOOMING
 from raybeam import available_backends
 
 WHITE = [Material("*", reflectance=1.0)]
@@ -576,7 +576,7 @@ def test_batches_do_not_matter(subrays, monkeypatch):
     causes = np.frombuffer(whole[0]["cause"], np.uint8)
     assert set(causes.tolist()) == {SURFACE, FALSE_ALARM, CROSSTALK, BLOOMING}
     first = cast_between(rig, survey, [0, 2])
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 500)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 500)
     assert cast_between(rig, survey, [0, 2]) == first
 
 

@@ -11,28 +11,23 @@ from tests.lidarsim.reference import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
+from lidarsim.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.media.weather import Air, spray_clumps
 from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states
+from lidarsim.pulses.returns import NO_SURFACE, Keys, PulseReturns
+from lidarsim.pulses.steps import spray_loops
+from lidarsim.pulses.steps.detection import is_detected
+from lidarsim.pulses.steps.particles import AIR, WeatherStep, exponential_quantiles, seen_by_range
+from lidarsim.pulses.steps.pulse_loops import SampledHits
+from lidarsim.pulses.steps.random_loops import RandomKeys
+from lidarsim.pulses.steps.range_noise import noisy_ranges
+from lidarsim.pulses.steps.saturation import apply_saturation
+from lidarsim.pulses.steps.separation import Reporting, separate_hits
+from lidarsim.pulses.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
+from lidarsim.pulses.steps.step_list import setup_of
+from lidarsim.pulses.steps.waveform import Digitizer, returns_in
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
-from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
-from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
-from lidarsim.simulator.steps import spray_loops
-from lidarsim.simulator.steps.detection import is_detected
-from lidarsim.simulator.steps.particles import (
-    AIR,
-    WeatherStep,
-    exponential_quantiles,
-    seen_by_range,
-)
-from lidarsim.simulator.steps.pulse_loops import SampledHits
-from lidarsim.simulator.steps.random_loops import RandomKeys
-from lidarsim.simulator.steps.range_noise import noisy_ranges
-from lidarsim.simulator.steps.saturation import apply_saturation
-from lidarsim.simulator.steps.separation import Reporting, separate_hits
-from lidarsim.simulator.steps.spray import SPRAY_DEPTH, SPRAY_DIAMETER, SPRAY_SUBRAY
-from lidarsim.simulator.steps.step_list import setup_of
-from lidarsim.simulator.steps.waveform import Digitizer, returns_in
 
 GAP = 0.75
 KEYS = Keys(3, np.array([0, 40, 41, 300]))

@@ -29,7 +29,7 @@ from lidarpool import (
 )
 from lidarsim import SceneMesh
 from lidarsim.media.materials import extinction, fresnel
-from lidarsim.simulator.steps.cast import MAX_PASSES, MAX_REFLECTIONS
+from lidarsim.pulses.steps.cast import MAX_PASSES, MAX_REFLECTIONS
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}
 SURFACE = level("Water", 0, 90)

@@ -11,8 +11,8 @@ from tests.shapes import Cart, cast_between, tally_of
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarsim import box
+from lidarsim.casting import static_bodies
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster

@@ -23,11 +23,11 @@ from lidarpool import (
 )
 from lidarpool.columns.parts import pack
 from lidarsim import box
+from lidarsim.casting import static_bodies
+from lidarsim.casting.clipping import box_planes, clip_triangles
 from lidarsim.columns.table import OPTIONAL
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.casting import static_bodies
-from lidarsim.simulator.casting.clipping import box_planes, clip_triangles
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 

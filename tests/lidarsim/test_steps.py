@@ -15,14 +15,14 @@ from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, l
 from lidarsim.columns.table import CAUSES
 from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
 from lidarsim.numerics.random_numbers import Purpose
-from lidarsim.simulator.returns import SURFACE, PulseReturns, merge_returns, returns_without_surface
+from lidarsim.pulses.returns import SURFACE, PulseReturns, merge_returns, returns_without_surface
+from lidarsim.pulses.steps.cast import CastStep
+from lidarsim.pulses.steps.doppler import VELOCITY
+from lidarsim.pulses.steps.losses import DirtStep
+from lidarsim.pulses.steps.step import PulseStep, Role
+from lidarsim.pulses.steps.step_list import STEPS, add_step, received_causes, remove_step
+from lidarsim.pulses.steps.waveform_samples import RecordingStep
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.cast import CastStep
-from lidarsim.simulator.steps.doppler import VELOCITY
-from lidarsim.simulator.steps.losses import DirtStep
-from lidarsim.simulator.steps.step import PulseStep, Role
-from lidarsim.simulator.steps.step_list import STEPS, add_step, received_causes, remove_step
-from lidarsim.simulator.steps.waveform_samples import RecordingStep
 from lidarsim.survey.survey import OPTIONAL_NAMES
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"

@@ -27,8 +27,8 @@ from lidarpool import (
 )
 from lidarsim import SceneMesh
 from lidarsim.media.leaves import NAMES, leaf_angle_density, mean_brightness, mean_projection
+from lidarsim.pulses.steps.light_in_media import random_depths
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.light_in_media import random_depths
 
 GROUND = Material("*", 0.3)
 cast = partial(shapes.cast, backend="tiles")

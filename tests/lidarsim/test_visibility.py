@@ -31,10 +31,10 @@ from lidarpool import (
     Track,
 )
 from lidarsim import SceneMesh, box
+from lidarsim.casting import static_bodies
 from lidarsim.columns.table import CAUSES
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.memory import rig_bytes
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.device_columns import DevicePoints
@@ -236,7 +236,7 @@ def test_chunks_of_rays_change_no_byte(name, monkeypatch):
     rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 2])
     assert len(whole[0]["x"]) > 500
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 200)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 200)
     assert cast_between(rig, survey, [0, 2]) == whole
 
 

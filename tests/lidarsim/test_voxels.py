@@ -352,8 +352,8 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
     whole = cast_between(rig, survey, [0, 24])
     assert len(whole[0]["x"]) > 4000
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
-    monkeypatch.setattr("lidarsim.simulator.casting.voxels.BLOCK_RAYS", 33)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 1000)
+    monkeypatch.setattr("lidarsim.casting.voxels.BLOCK_RAYS", 33)
     assert cast_between(rig, survey, [0, 1, 5, 12, 17, 24]) == whole
     if "tiles" in CPU:
         other = Rig(Scene.from_meshes(meshes), survey, "tiles")

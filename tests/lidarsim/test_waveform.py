@@ -26,12 +26,12 @@ from lidarpool import (
 from lidarsim import Optics
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
+from lidarsim.pulses.returns import PulseReturns
+from lidarsim.pulses.steps.waveform import Digitizer, returns_in
+from lidarsim.pulses.steps.waveform_samples import digitize
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
-from lidarsim.simulator.steps.waveform import Digitizer, returns_in
-from lidarsim.simulator.steps.waveform_samples import digitize
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -292,7 +292,7 @@ def test_chunks_of_rays_change_no_record(monkeypatch):
     rig = Rig(fence(), made, "numpy")
     whole, tally = cast_between(rig, made, [0, 1])
     assert len(whole["x"]) > 4 * 50
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 1000)
     assert cast_between(rig, made, [0, 1]) == (whole, tally)
 
 

@@ -13,7 +13,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
-import lidarsim.simulator.casting.static_bodies
+import lidarsim.casting.static_bodies
 from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, box, save_cloud, simulate
 from lidarpool.run.pipeline import rigs
 
@@ -89,9 +89,9 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
 ):
     before = {*rigs.cached_rigs}  # of other tests of this process
     trees = []
-    build = lidarsim.simulator.casting.static_bodies.RayCaster
+    build = lidarsim.casting.static_bodies.RayCaster
     monkeypatch.setattr(
-        lidarsim.simulator.casting.static_bodies,
+        lidarsim.casting.static_bodies,
         "RayCaster",
         lambda *a, **o: trees.append(1) or build(*a, **o),
     )

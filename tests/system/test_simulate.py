@@ -250,7 +250,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             r"Stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarsim.simulator.casting.static_bodies.RayCaster",
+            "lidarsim.casting.static_bodies.RayCaster",
             raise_at(None),
             "Preparing the scene on the casting workers failed: .*the mirror is loose",
         ),

@@ -9,7 +9,7 @@ from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_be
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Survey
-from lidarsim.simulator.steps.range_noise import range_walk
+from lidarsim.pulses.steps.range_noise import range_walk
 
 NOISE = Noise(0.01, detection_range_m=100, range_at_threshold_m=0.1)
 WALK = Noise(0.01, detection_range_m=100, walk_m=0.02)

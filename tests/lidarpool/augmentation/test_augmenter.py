@@ -463,7 +463,7 @@ def test_results_do_not_depend_on_how_pulses_are_divided(clear, sensor, monkeypa
         "actors": (Actor(replace(CAR, name="Moving"), track),),
     }
     whole = augmented(clear, sensor, **effects)
-    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1 << 11)
+    monkeypatch.setattr("lidarsim.pulses.pulses.CHUNK_RAYS", 1 << 11)
     for one, other in zip(whole, augmented(clear, sensor, **effects), strict=True):
         assert np.array_equal(one.sweep.points, other.sweep.points)
         assert one.sweep.columns.keys() == other.sweep.columns.keys()

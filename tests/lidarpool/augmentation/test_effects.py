@@ -15,9 +15,9 @@ from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import Weather
+from lidarsim.pulses.steps.step import Role
+from lidarsim.pulses.steps.step_list import STEPS
 from lidarsim.simulator.recorded_sweeps import scene_of_bodies
-from lidarsim.simulator.steps.step import Role
-from lidarsim.simulator.steps.step_list import STEPS
 from lidarsim.survey.faults import Fault
 
 EXAMPLES = Path(__file__).parents[3] / "examples"

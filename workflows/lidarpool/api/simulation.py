@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Unpack
 
+from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_number
 from lidarsim.schema.declared import declared_values
-from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.survey.survey import Survey
 from lidarsim.words import did_you_mean
 

@@ -12,10 +12,10 @@ from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Integers, Ints, to_writable
+from lidarsim.pulses.returns import PulseReturns
+from lidarsim.pulses.steps.step import RecordedPulses
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, RecordedSensor
-from lidarsim.simulator.returns import PulseReturns
-from lidarsim.simulator.steps.step import RecordedPulses
 
 from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep

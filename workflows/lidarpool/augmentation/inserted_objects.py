@@ -14,11 +14,11 @@ from lidarsim.media.materials import Material
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
+from lidarsim.pulses.returns import PulseReturns
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
-from lidarsim.simulator.returns import PulseReturns
 from lidarsim.words import did_you_mean, join_names, make_distinct, plural
 
 from ..clouds.boxes import SweepBoxes

@@ -13,11 +13,11 @@ from typing import Any
 from lidarsim.errors import Mistakes
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER
+from lidarsim.pulses.steps.step import Setup
+from lidarsim.pulses.steps.step_list import STEPS
 from lidarsim.scene.actors import Actor
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import scene_of_bodies
-from lidarsim.simulator.steps.step import Setup
-from lidarsim.simulator.steps.step_list import STEPS
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import Mounted, Survey
 

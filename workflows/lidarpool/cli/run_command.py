@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.table import NO_SURFACE
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
-from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.words import format_scan_counts, plural
 
 from ..clouds.folder import local_result, output_destination, result_folder

@@ -14,6 +14,8 @@ import numpy as np
 from dask.system import CPU_COUNT
 from distributed.system import MEMORY_LIMIT
 
+from lidarsim.casting.scene_caster import check_backend_here
+from lidarsim.casting.visibility import unseen_objects
 from lidarsim.columns.cloud import CHUNK_POINTS
 from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.allowance import bytes_of
@@ -21,8 +23,6 @@ from lidarsim.io.storage import Storage
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.sensor.noise import Noise
 from lidarsim.sensor.optics import Returns
-from lidarsim.simulator.casting.scene_caster import check_backend_here
-from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.simulator.memory import (
     INSTANCE,
     MB,

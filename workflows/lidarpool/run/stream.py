@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
+from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.sweep import Sweep
@@ -27,7 +28,6 @@ from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, message_of
-from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.memory import MB, scans_that_fit
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available

@@ -16,12 +16,12 @@ from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.navigation import Gnss, Imu
 from lidarsim.motion.trajectory import CENTER, Track, presence_ns
+from lidarsim.pulses.steps.particles import WeatherStep
+from lidarsim.pulses.steps.step_list import setup_of
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import is_written_by_lidarpool
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.optics import TWO_RETURNS
-from lidarsim.simulator.steps.particles import WeatherStep
-from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 from lidarsim.words import format_as_scenario, format_rounded, join_names, list_names, plural
 

@@ -11,15 +11,15 @@ from typing import Any, Self
 
 import numpy as np
 
+from lidarsim.casting.static_bodies import warn_of_reach
+from lidarsim.casting.surfaces import warn_of_gray
+from lidarsim.casting.visibility import unseen_objects
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.actors import check_spray
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_fields, check_type
 from lidarsim.schema.value_texts import one_line
-from lidarsim.simulator.casting.static_bodies import warn_of_reach
-from lidarsim.simulator.casting.surfaces import warn_of_gray
-from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarscenes.procedural.surroundings import EnclosingBody, PlacementChecker
+from lidarsim.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses, velocities
 from lidarsim.numerics.arrays import Bools, Floats
@@ -16,7 +17,6 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
-from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.simulator.sampling import sample_near_surfaces
 from lidarsim.survey.survey import Survey
 from lidarsim.words import format_as_scenario, format_rounded, printable

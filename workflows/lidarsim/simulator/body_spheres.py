@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..casting.motion import CastPoses
 from ..motion.trajectory import full_poses
 from ..numerics.arrays import Bools, Floats
 from ..numerics.vectors import dot, norm, rotate_into_frames
 from ..scene.scene import Scene
 from ..sensor.disc import Beam
-from .casting.motion import CastPoses
 
 _BLOCK_BEAMS = 1024  # number of consecutive beams that are treated alike
 

@@ -7,18 +7,18 @@ from functools import partial
 
 import numpy as np
 
+from ..casting.ray_chunks import CHUNK_RAYS as VISIBILITY_RAYS
+from ..casting.visibility import static_key, unseen_objects
 from ..numerics.elementary import exp
+from ..pulses.pulses import CHUNK_RAYS
+from ..pulses.steps.step import Memory, Setup, Sizes
+from ..pulses.steps.step_list import setup_of, steps_of
 from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor.optics import TWO_RETURNS
 from ..survey.survey import Survey
-from .casting.ray_chunks import CHUNK_RAYS as VISIBILITY_RAYS
-from .casting.visibility import static_key, unseen_objects
 from .points.device_columns import needs_hits
-from .pulses import CHUNK_RAYS
 from .rig import PATTERN_RAYS, rays_repeat
-from .steps.step import Memory, Setup, Sizes
-from .steps.step_list import setup_of, steps_of
 
 MB = 1_000_000
 

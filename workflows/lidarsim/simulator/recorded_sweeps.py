@@ -12,8 +12,16 @@ import numpy as np
 
 from raybeam import Pattern
 
+from ..casting.actor_trajectories import ActorTrajectories
+from ..casting.motion import CastPoses, FiringClock, Firings
+from ..casting.scene_caster import casters_of_sensors
+from ..casting.surfaces import SceneSurfaces
 from ..motion.trajectory import CENTER
 from ..numerics.arrays import Floats, Ints
+from ..pulses.pulses import BeamRange, PulseCaster
+from ..pulses.returns import PulseReturns
+from ..pulses.steps.cast import has_bodies
+from ..pulses.steps.step import RecordedPulses
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..scene.scene_mesh import SceneMesh
@@ -21,14 +29,6 @@ from ..sensor import Noise, Returns, Sensor, Spin
 from ..sensor.beams import Beams
 from ..survey.survey import Mounted, ScanSpec, Survey
 from .body_spheres import firings_near_bodies, ranges_of_firings
-from .casting.actor_trajectories import ActorTrajectories
-from .casting.motion import CastPoses, FiringClock, Firings
-from .casting.scene_caster import casters_of_sensors
-from .casting.surfaces import SceneSurfaces
-from .pulses import BeamRange, PulseCaster
-from .returns import PulseReturns
-from .steps.cast import has_bodies
-from .steps.step import RecordedPulses
 
 RECORDING = "recording"  # name of the invisible object that stands for recorded surfaces
 

@@ -11,25 +11,25 @@ import numpy as np
 
 from raybeam import Pattern
 
+from ..casting.actor_trajectories import ActorTrajectories
+from ..casting.actor_visibility import ActorVisibility
+from ..casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
+from ..casting.ray_chunks import ray_chunks
+from ..casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
+from ..casting.surfaces import SceneSurfaces
 from ..columns.actor_rays import NO_ACTOR_RAYS
 from ..errors import LidarError
 from ..motion.trajectory import Trajectory
 from ..numerics.arrays import Floats, Floats32, Integers, Ints32, Records
 from ..numerics.vectors import rotate
+from ..pulses.pulses import PulseCaster
+from ..pulses.returns import require_column
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Sensor
 from ..survey.survey import ScanSpec, Survey
-from .casting.actor_trajectories import ActorTrajectories
-from .casting.actor_visibility import ActorVisibility
-from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
-from .casting.ray_chunks import ray_chunks
-from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
-from .casting.surfaces import SceneSurfaces
 from .points.batch_points import BatchPoints
 from .points.device_columns import DeviceColumns, DevicePoints
-from .pulses import PulseCaster
-from .returns import require_column
 
 # Largest number of rays in a period of the head that are stored, at 24 bytes each. Directions
 # repeat after each period.

@@ -15,6 +15,10 @@ from pydantic import Field
 
 from raybeam.poses import check_poses
 
+from ..casting.motion import check_trajectory
+from ..casting.scene_caster import check_backend_here
+from ..casting.static_bodies import warn_of_reach
+from ..casting.surfaces import warn_of_gray
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, FLOW, FLOW_EGO, SCAN, Column
 from ..errors import LidarError
@@ -31,10 +35,6 @@ from ..sensor import Noise, Returns, Sensor
 from ..survey.survey import Mounted, ScanSpec, Survey
 from ..words import name_hint
 from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
-from .casting.motion import check_trajectory
-from .casting.scene_caster import check_backend_here
-from .casting.static_bodies import warn_of_reach
-from .casting.surfaces import warn_of_gray
 from .points.batch_columns import columns_of
 from .rig import Rig
 

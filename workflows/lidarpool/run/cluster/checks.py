@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from distributed import Client
 
 from lidarsim._version import __version__
+from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError
-from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import take_snapshot
 from poolpart.workers import run_on_workers, worker_identities

@@ -9,8 +9,8 @@ from typing import Any, Self
 from distributed import Client, get_worker
 from distributed.comm.core import CommClosedError
 
+from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.errors import LidarError
-from lidarsim.simulator.casting.scene_caster import check_backend_here
 from poolpart import Partition, PoolError
 from poolpart.task_context import own_client
 

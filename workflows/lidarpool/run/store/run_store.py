@@ -14,10 +14,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
-from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
 from lidarsim.words import format_rounded
 
 from ...columns.parts import deletable_files, mark_name, parse_part_name

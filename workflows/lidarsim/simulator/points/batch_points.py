@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ...casting.motion import CastPoses, Firings
+from ...casting.surfaces import SceneSurfaces, sensor_light_of
 from ...columns.actor_rays import NO_ACTOR_RAYS
 from ...columns.table import Column
 from ...columns.waveforms import column_type
@@ -18,18 +20,16 @@ from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, U
 from ...numerics.elementary import arccos, arcsin, arctan2, power
 from ...numerics.random_numbers import normal
 from ...numerics.vectors import dot, rotate
+from ...pulses.pulses import ScannedReturns
+from ...pulses.returns import require_column
+from ...pulses.steps.cast import GHOST
+from ...pulses.steps.doppler import VELOCITY, radial_velocities
+from ...pulses.steps.step_list import received_causes
 from ...scene.colors import unpack_colors
 from ...scene.scene import Scene
 from ...sensor.optics import LIGHT_M_NS, MIN_COSINE
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
-from ..casting.motion import CastPoses, Firings
-from ..casting.surfaces import SceneSurfaces, sensor_light_of
-from ..pulses import ScannedReturns
-from ..returns import require_column
-from ..steps.cast import GHOST
-from ..steps.doppler import VELOCITY, radial_velocities
-from ..steps.step_list import received_causes
 from .scene_flow import SceneFlow, SurfacePoints, compute_flow
 
 BLOCK_HITS = 1 << 16  # number of hits whose normals are computed at a time

@@ -30,17 +30,17 @@ from raybeam.device import (
 )
 from raybeam.scan import Scan, check_scan
 
+from ...casting.motion import CastPoses
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...columns.actor_rays import NO_ACTOR_RAYS
 from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ...media.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
 from ...numerics.arrays import AnyArray, Floats, Floats32, Indices, Ints, Records
+from ...pulses.pulses import ScannedReturns
+from ...pulses.returns import SURFACE, PulseReturns
 from ...scene.scene import Scene
 from ...survey.survey import ScanSpec, Survey
-from ..casting.motion import CastPoses
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
-from ..pulses import ScannedReturns
-from ..returns import SURFACE, PulseReturns
 from .batch_points import BatchPoints
 
 OPTIONS = "-std=c++17", "-fmad=false"  # compiler options

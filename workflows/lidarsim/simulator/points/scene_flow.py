@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...casting.actor_surfaces import ActorSurfaces
+from ...casting.actor_trajectories import ActorTrajectories
 from ...motion.trajectory import mounted_poses
 from ...numerics.arrays import Floats, Indices, Integers, Ints, Ints32
 from ...numerics.vectors import rotate, rotate_into_frames
 from ...survey.survey import ScanSpec, Survey
-from ..casting.actor_surfaces import ActorSurfaces
-from ..casting.actor_trajectories import ActorTrajectories
 
 BLOCK_POINTS = 1 << 14  # number of points whose flow is computed at a time
 _ROUNDING_NS = 1.0  # firing times are rounded to nanoseconds

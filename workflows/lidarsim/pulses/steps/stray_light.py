@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces, sensor_light_of
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, to_writable
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import dot, norm, rotate, rotate_into_frames
 from ...scene.scene import Scene
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merge_returns, returns_without_surface
 from .detection import exceeds_threshold
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes

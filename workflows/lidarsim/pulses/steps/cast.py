@@ -13,6 +13,11 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ...casting.actor_trajectories import ActorTrajectories
+from ...casting.motion import CastPoses, FiringClock, order_along_rings
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces, sensor_light_of
+from ...casting.visibility import unseen_objects
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
 from ...numerics.arrays import (
@@ -29,11 +34,6 @@ from ...numerics.arrays import (
 from ...numerics.random_numbers import Purpose, normal, raw, uniform
 from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
-from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, FiringClock, order_along_rings
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces, sensor_light_of
-from ..casting.visibility import unseen_objects
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
 from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, random_depths
@@ -645,7 +645,7 @@ class CastStep(PulseStep):
         Light is dropped only if there are mirrors and no medium refracts. Refraction can increase
         the energy beyond the limit that is computed here.
         """
-        from ..casting import surface_loops  # imported here: numba takes half a second to import
+        from ...casting import surface_loops  # imported here: numba takes half a second to import
 
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
@@ -837,7 +837,7 @@ def _pattern_behind(
     The light ends at distances `step_m` (n,) in meters from its origins. `outgoing` (n, 3) are the
     directions of the rays, whose lengths must be close to 1.
     """
-    from ..casting import surface_loops
+    from ...casting import surface_loops
 
     origins = np.empty((3, len(clear_m)))
     directions = to_writable(outgoing.T)

@@ -36,13 +36,13 @@ import numpy as np
 
 from raybeam import Pattern
 
+from ..casting.motion import CastPoses, Firings
+from ..casting.scene_caster import SceneCaster
+from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..numerics.arrays import Floats, Ints, to_writable
 from ..scene.scene import Scene
 from ..sensor.noise import Noise
 from ..survey.survey import Survey
-from .casting.motion import CastPoses, Firings
-from .casting.scene_caster import SceneCaster
-from .casting.surfaces import SceneSurfaces, sensor_light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, require_column
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, RecordedPulses, Role

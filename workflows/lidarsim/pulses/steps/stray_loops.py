@@ -12,10 +12,10 @@ import numpy as np
 from raybeam.compiled import compiled, inlined, noinline
 from raybeam.ray_loops import perpendicular_axes
 
+from ...casting.surface_loops import normal_incidence_energy
 from ...numerics.arrays import Bools, Floats, Ints
 from ...numerics.elementary_loops import arctan2, sin_cos
 from ...sensor.optics import LIGHT_M_NS
-from ..casting.surface_loops import normal_incidence_energy
 
 CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
 MAX_STRAY = math.radians(30.0)  # maximum angle between a ray and stray light

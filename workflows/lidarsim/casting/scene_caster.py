@@ -26,14 +26,14 @@ from raybeam.device import ExternalHits
 from raybeam.moving import body_hits, nearest_body_hits
 from raybeam.scan import Scan, check_scan
 
-from ...environment.interrupts import defer_interrupts
-from ...errors import LidarError
-from ...numerics.arrays import Bools, Floats, Indices, Ints, Ints32
-from ...scene.actors import Actor, distinct_meshes
-from ...scene.scene import Scene
-from ...scene.scene_instances import Instances, split_by_masks
-from ...survey.survey import Survey
-from ...words import did_you_mean
+from ..environment.interrupts import defer_interrupts
+from ..errors import LidarError
+from ..numerics.arrays import Bools, Floats, Indices, Ints, Ints32
+from ..scene.actors import Actor, distinct_meshes
+from ..scene.scene import Scene
+from ..scene.scene_instances import Instances, split_by_masks
+from ..survey.survey import Survey
+from ..words import did_you_mean
 from .actor_trajectories import ActorTrajectories
 from .motion import CastPoses, FiringClock
 from .static_bodies import StaticBodies, largest_range_m, mesh_of

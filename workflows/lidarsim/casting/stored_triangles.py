@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...numerics.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, to_writable
-from ...numerics.vectors import inverse, norm
-from ...scene.actors import distinct_meshes
-from ...scene.colors import Colors
-from ...scene.scene import Scene
+from ..numerics.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, to_writable
+from ..numerics.vectors import inverse, norm
+from ..scene.actors import distinct_meshes
+from ..scene.colors import Colors
+from ..scene.scene import Scene
 
 if TYPE_CHECKING:
     from .surface_loops import TriangleNumbers, TriangleOwners

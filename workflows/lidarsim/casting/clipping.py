@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics.arrays import Bools, Floats, Indices, Integers, Ints
+from ..numerics.arrays import Bools, Floats, Indices, Integers, Ints
 
 _Corner = tuple[float, float, float]  # x, y, z of a corner
 

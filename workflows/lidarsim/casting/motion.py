@@ -12,11 +12,11 @@ import numpy as np
 import raybeam.poses
 from raybeam import Pattern, PoseMotion, pattern_rays
 
-from ...motion.trajectory import Trajectory, velocities
-from ...numerics.arrays import Floats, Indices, Integers, Ints, to_writable
-from ...numerics.vectors import matmul, rotate_into_frames
-from ...sensor import Sensor
-from ...survey.survey import Mounted, ScanSpec
+from ..motion.trajectory import Trajectory, velocities
+from ..numerics.arrays import Floats, Indices, Integers, Ints, to_writable
+from ..numerics.vectors import matmul, rotate_into_frames
+from ..sensor import Sensor
+from ..survey.survey import Mounted, ScanSpec
 from .actor_trajectories import ActorTrajectories
 
 RING_FIRINGS = 16  # number of firings whose rays `order_along_rings` sorts by ring

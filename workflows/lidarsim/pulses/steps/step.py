@@ -19,6 +19,9 @@ import numpy as np
 
 from raybeam import Pattern, SubRays
 
+from ...casting.motion import CastPoses, Firings
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...columns.table import VELOCITY
 from ...numerics.arrays import Bools, Floats, Indices, Ints
 from ...numerics.random_numbers import Purpose
@@ -27,9 +30,6 @@ from ...scene.scene import Scene
 from ...sensor import Noise, Returns, Sensor
 from ...survey.faults import Fault, FaultKind
 from ...survey.survey import Survey
-from ..casting.motion import CastPoses, Firings
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
 from ..returns import Keys, Planes, PulseReturns
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from raybeam import Instance, Mesh, Opacity, RayCaster, ScanReturns
 from raybeam.registry import choose_backend
 
-from ...numerics.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
-from ...scene.scene import Scene
-from ...scene.scene_instances import Instances, MeshPart
-from ...survey.survey import Survey
+from ..numerics.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
+from ..scene.scene import Scene
+from ..scene.scene_instances import Instances, MeshPart
+from ..survey.survey import Survey
 from .clipping import ClippedMesh, box_planes, clip_triangles
 
 _log = logging.getLogger(__name__)

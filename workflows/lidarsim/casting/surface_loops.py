@@ -11,11 +11,11 @@ import numpy as np
 from raybeam.compiled import compiled, inlined
 from raybeam.rays import UNIT_SLACK
 
-from ...media.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
-from ...media.materials import fresnel as fresnel_of_arrays
-from ...media.materials import water_film_factor as water_film_factor_of_arrays
-from ...numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
-from ...numerics.elementary_loops import exp, sin_cos
+from ..media.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
+from ..media.materials import fresnel as fresnel_of_arrays
+from ..media.materials import water_film_factor as water_film_factor_of_arrays
+from ..numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
+from ..numerics.elementary_loops import exp, sin_cos
 
 fresnel = inlined(fresnel_of_arrays)
 water_film_factor = inlined(water_film_factor_of_arrays)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...media.materials import match_object_names
-from ...numerics.arrays import Bools
-from ...scene.scene import Scene
-from ...survey.survey import Survey
+from ..media.materials import match_object_names
+from ..numerics.arrays import Bools
+from ..scene.scene import Scene
+from ..survey.survey import Survey
 
 
 def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...numerics.arrays import Bools, Floats, Indices
-from ...numerics.vectors import inverse, matmul, matvec
-from ...scene.scene_instances import Instances
+from ..numerics.arrays import Bools, Floats, Indices
+from ..numerics.vectors import inverse, matmul, matvec
+from ..scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # number of rays that are followed at a time, to fit a cache
 _LEVEL = 1e-30  # voxels per meter; light that is slower along an axis stays in its voxel layer

@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ...media.materials import Material, SurfaceKinds, first_matches
-from ...numerics.arrays import Indices, Integers, Ints32
-from ...scene.face_materials import FaceMaterials
-from ...scene.scene import Scene
+from ..media.materials import Material, SurfaceKinds, first_matches
+from ..numerics.arrays import Indices, Integers, Ints32
+from ..scene.face_materials import FaceMaterials
+from ..scene.scene import Scene
 from .stored_triangles import StoredTriangles
 
 

@@ -10,6 +10,9 @@ import numpy as np
 
 from raybeam import Pattern
 
+from ...casting.motion import CastPoses, FiringClock
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...columns.table import CAUSES
 from ...media.materials import normal_incidence_energy
 from ...numerics.arrays import Floats, Indices, Ints, Ints32, to_writable
@@ -20,9 +23,6 @@ from ...numerics.vectors import dot, norm, rotate, rotate_into_frames
 from ...sensor import Sensor
 from ...sensor.optics import LIGHT_M_NS
 from ...survey.survey import ScanSpec, Survey, firing_start_ns
-from ..casting.motion import CastPoses, FiringClock
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     PulseReturns,

@@ -18,6 +18,10 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 from raybeam.sub_rays import perpendicular_axes
 
+from ...casting.actor_trajectories import ActorTrajectories
+from ...casting.motion import CastPoses, FiringClock
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...errors import LidarError
 from ...media.leaves import mean_brightness, mean_projection
 from ...media.materials import MaterialTable, fresnel
@@ -27,10 +31,6 @@ from ...numerics.elementary_scalars import log_of
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import dot, matvec
 from ...scene.scene import Scene
-from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses, FiringClock
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
 from ..returns import select_rows
 
 LEAF = Purpose(30, "depth to which light penetrates leaves")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...motion.trajectory import (
+from ..motion.trajectory import (
     ALWAYS,
     StaticPose,
     Stations,
@@ -21,8 +21,8 @@ from ...motion.trajectory import (
     find_batch,
     presence_ns,
 )
-from ...numerics.arrays import Bools, Floats, Indices, Integers, Ints, to_writable
-from ...scene.actors import Actor
+from ..numerics.arrays import Bools, Floats, Indices, Integers, Ints, to_writable
+from ..scene.actors import Actor
 
 if TYPE_CHECKING:
     from .surface_loops import TrackTable

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...casting.actor_trajectories import ActorTrajectories
+from ...casting.motion import CastPoses
+from ...casting.surfaces import SceneSurfaces
 from ...numerics.arrays import Floats, Integers, Ints, Ints32
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import dot
-from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import CastPoses
-from ..casting.surfaces import SceneSurfaces
 
 VELOCITY = Purpose(40, "radial velocity noise of a return")
 BLOCK_HITS = 1 << 13  # number of hits that are computed at a time, to fit a cache

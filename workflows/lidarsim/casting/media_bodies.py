@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ...media.materials import MaterialTable
-from ...numerics.arrays import Bools, Floats, Integers
-from ...numerics.vectors import inverse, matvec, norm
-from ...scene.scene import Scene
+from ..media.materials import MaterialTable
+from ..numerics.arrays import Bools, Floats, Integers
+from ..numerics.vectors import inverse, matvec, norm
+from ..scene.scene import Scene
 from .triangle_kinds import TriangleKinds
 
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, particle_range
@@ -22,8 +24,6 @@ from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
 from ...numerics.random_numbers import Purpose, named_seed, scan_states
 from ...sensor.noise import THRESHOLD_SIGMAS
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     SURFACE,

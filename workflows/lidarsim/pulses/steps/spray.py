@@ -14,16 +14,16 @@ import numpy as np
 
 from raybeam.moving import pair_cells_with_boxes
 
+from ...casting.actor_trajectories import ActorTrajectories
+from ...casting.motion import order_along_rings
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces
 from ...columns.table import CAUSES
 from ...media.weather import FAINTEST, LARGE, particle_range, spray_clumps
 from ...numerics.arrays import Floats, Ints, to_writable
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import norm, rotate_into_frames
 from ...scene.actors import check_spray
-from ..casting.actor_trajectories import ActorTrajectories
-from ..casting.motion import order_along_rings
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces
 from ..returns import (
     RETURN_COLUMNS,
     PulseReturns,

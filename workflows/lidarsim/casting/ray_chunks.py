@@ -11,9 +11,9 @@ import numpy as np
 from raybeam import Pattern
 from raybeam.scan import Scan, check_scan
 
-from ...numerics.arrays import Bools, Floats
-from ...sensor import Sensor
-from ...survey.survey import ScanSpec
+from ..numerics.arrays import Bools, Floats
+from ..sensor import Sensor
+from ..survey.survey import ScanSpec
 from .motion import CastPoses
 
 CHUNK_RAYS = 1 << 17  # number of rays that are cast at a time

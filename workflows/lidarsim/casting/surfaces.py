@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...media.materials import NEAR_NM, Material, MaterialTable, normal_incidence_energy
-from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, to_writable
-from ...numerics.vectors import rotate_into_frames
-from ...scene.colors import GRAY, Lookup, join_colors, luminance, pack_colors
-from ...scene.scene import Scene
-from ...sensor import Sensor
-from ...survey.survey import Survey
+from ..media.materials import NEAR_NM, Material, MaterialTable, normal_incidence_energy
+from ..numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, to_writable
+from ..numerics.vectors import rotate_into_frames
+from ..scene.colors import GRAY, Lookup, join_colors, luminance, pack_colors
+from ..scene.scene import Scene
+from ..sensor import Sensor
+from ..survey.survey import Survey
 from .actor_surfaces import ActorSurfaces
 from .actor_trajectories import ActorTrajectories
 from .media_bodies import MediaBodies

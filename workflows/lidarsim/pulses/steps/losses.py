@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...casting.motion import Firings
 from ...numerics.arrays import Bools, Floats, to_writable
 from ...numerics.elementary import sin_cos
 from ...numerics.vectors import hypot
 from ...survey.faults import PACKET, Fault
-from ..casting.motion import Firings
 from ..returns import PulseReturns, require_column
 from .step import PulseBatch, PulseStep, Role, Setup
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...casting.scene_caster import SceneCaster
+from ...casting.surfaces import SceneSurfaces, sensor_light_of
 from ...numerics.arrays import Floats, Integers
 from ...numerics.elementary import exp
 from ...scene.colors import GRAY, pack_colors
-from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, concatenate_returns
 from .particles import light_reach
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...motion.trajectory import velocities
-from ...numerics.arrays import Floats, Indices, Integers, Ints
-from ...numerics.vectors import dot, matvec, rotate_into_frames
+from ..motion.trajectory import velocities
+from ..numerics.arrays import Floats, Indices, Integers, Ints
+from ..numerics.vectors import dot, matvec, rotate_into_frames
 from .actor_trajectories import ActorTrajectories
 from .stored_triangles import StoredTriangles
 

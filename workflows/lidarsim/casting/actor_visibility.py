@@ -16,15 +16,15 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ...columns.actor_rays import ACTOR_RAYS
-from ...motion.trajectory import full_poses, presence_ns
-from ...numerics.arrays import Bools, Floats, Indices, Ints, Records
-from ...numerics.elementary import arctan2
-from ...numerics.vectors import hypot, matvec, norm, rotate
-from ...scene.scene import Scene
-from ...sensor import Sensor
-from ...survey.survey import ScanSpec, Survey
-from ...survey.sweep_poses import sensor_pose
+from ..columns.actor_rays import ACTOR_RAYS
+from ..motion.trajectory import full_poses, presence_ns
+from ..numerics.arrays import Bools, Floats, Indices, Ints, Records
+from ..numerics.elementary import arctan2
+from ..numerics.vectors import hypot, matvec, norm, rotate
+from ..scene.scene import Scene
+from ..sensor import Sensor
+from ..survey.survey import ScanSpec, Survey
+from ..survey.sweep_poses import sensor_pose
 from .motion import CastPoses
 from .ray_chunks import RayChunk, ray_chunks
 from .scene_caster import NEVER_NS, SceneCaster

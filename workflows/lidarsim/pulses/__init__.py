@@ -1,0 +1,1 @@
+"""Pulses of a sensor, and the steps that compute what it measures of each."""
