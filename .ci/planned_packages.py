@@ -37,8 +37,8 @@ PLANNED = {
             "processes.per_process", "processes.processors", "processes.freed_memory",
         )
     },
-    "lidarview.picture_file": "lidarfiles",
-    "lidarview.color_table": "lidarfiles",
+    "lidarfiles.picture_file": "lidarfiles",
+    "lidarfiles.color_table": "lidarfiles",
     **{
         f"lidarpool.{name}": "lidarscenario"
         for name in ("scenario", "plan", "mounting", "occupancy", "identity.shard")

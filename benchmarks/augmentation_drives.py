@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     Actor,
     Cloud,
@@ -25,8 +27,6 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.augmentation.effects import Effects
-from lidarpool.clouds.recording import Recording
-from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, CAUSES, SCAN

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import ks_2samp
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import ks_2samp
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Sensor, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects
 from lidarpool.augmentation.scan_pattern import ScanPattern
-from lidarpool.clouds.recording import Recording
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Floats

@@ -31,8 +31,8 @@ import numpy as np
 import psutil
 from distributed import Client
 
+from lidarfiles.parts.parts import pack
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.columns.parts import pack
 from lidarpool.report.output import CLOUD, SurveyOutput, run_survey
 from lidarpool.run.cluster.cluster import local_client
 from lidarpool.run.cluster.requirements import slots_needed

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarpool.clouds.intensity_full_scale import compute_full_scale
+from lidarfiles.clouds.intensity_full_scale import compute_full_scale
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.packets.encoders import START_NS
 

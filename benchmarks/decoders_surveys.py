@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.writing import ExportSpec, with_format_columns
 from lidarpool import Material, Mounted, Pose, Scene, Survey, Track, load_sensor
-from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.actors import Actor, box, join_meshes

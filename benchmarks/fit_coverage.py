@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
-from lidarpool.clouds.recording import Recording
 from lidarpool.comparing.fit.fitting import fit
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, place_instances

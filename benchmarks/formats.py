@@ -21,8 +21,8 @@ from pypcd4.pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import Cloud, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.clouds.writing import ExportSpec
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import layout
 from lidarsim.sweeps.sweeps import Sweeps

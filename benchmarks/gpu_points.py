@@ -21,8 +21,8 @@ from unittest.mock import patch
 import numpy as np
 
 import lidarsim.simulator.points.device_columns
+from lidarfiles.parts.parts import pack
 from lidarpool import Pose, Scanner, Scene, Sensor, Survey, Track
-from lidarpool.columns.parts import pack
 from lidarscenes.procedural.city import city
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.io.storage import Storage

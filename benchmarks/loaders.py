@@ -81,8 +81,8 @@ PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parqu
 
 def write_data_set(folder, name, cloud, sweeps):
     """Write a data set of jobs that have the same sweeps, like a campaign."""
-    from lidarpool.datasets.dataset import DataSet  # other versions may not have these modules
-    from lidarpool.datasets.job_table import JobRow, write_table
+    from lidarfiles.datasets.dataset import DataSet  # other versions may not have these modules
+    from lidarfiles.datasets.job_table import JobRow, write_table
     from lidarsim.io.storage import Storage
 
     data = DataSet(Storage.at(folder), name)

@@ -25,9 +25,9 @@ import numpy as np
 import trimesh
 from tests.simulated_drives import simulated_drive
 
+from lidarfiles.recordings.opening import open_recording
+from lidarfiles.work.work import FOLDER
 from lidarpool import Actor, Mounted, Pose, Scene, Survey, Track, load_sensor, twin
-from lidarpool.recordings.opening import open_recording
-from lidarpool.work.work import FOLDER
 from lidarscenes.procedural.cars import MODELS, car
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.scene_mesh import SceneMesh

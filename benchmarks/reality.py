@@ -34,7 +34,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from lidarpool.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, first_alignment
 from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
 from lidarpool.reconstruction.free_space import find_stationary_points
@@ -50,7 +51,6 @@ from lidarpool.reconstruction.submap_tasks import (
 )
 from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
 from lidarpool.reconstruction.vehicle_detection import find_poses_and_vehicle
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices

@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import Material, Pose, Returns, Scanner, Scene, Sensor, Track, load_sensor
-from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, first_alignment
 from lidarpool.reconstruction.building import DEFAULT_VOXEL_M, color_by_reflectance
 from lidarpool.reconstruction.free_space import find_stationary_points

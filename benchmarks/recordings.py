@@ -105,7 +105,7 @@ def write_kitti(folder, sweep_count):
 
 def write_inputs(folder, share=1.0):
     """Write all inputs with a fraction of the points or sweeps, unless they exist."""
-    from lidarpool.clouds.writing import ExportSpec
+    from lidarfiles.clouds.writing import ExportSpec
 
     if folder.exists():
         return
@@ -122,7 +122,7 @@ def write_inputs(folder, share=1.0):
 
 def read_items(path):
     """Open a recording and read its positions in meters and all columns."""
-    from lidarpool.recordings.opening import open_recording
+    from lidarfiles.recordings.opening import open_recording
 
     recording = open_recording(path)
     count = 0
@@ -140,8 +140,8 @@ def read_items(path):
 
 
 def view(path):
+    from lidarfiles.recordings.opening import open_sensors
     from lidarpool.pages.recorded import recorded_view
-    from lidarpool.recordings.opening import open_sensors
 
     return len(recorded_view(open_sensors(path), "recording", None).points)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarfiles.parts.parts import StoredCloud
 from lidarpool import Cloud
-from lidarpool.columns.parts import StoredCloud
 from lidarpool.report.cloud_counts import CloudCounts
 from lidarsim.columns.cloud import CloudLike
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpool.columns.parts import pack, part_name
+from lidarfiles.parts.parts import pack, part_name
 from lidarpool.run.pipeline.stage_messages import Receipt, samples_of_scan
 from lidarsim.columns.part_columns import PartColumns
 

@@ -200,6 +200,6 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     played.distributed.is_initialized = lambda: False
     for module in (played, played.utils, played.utils.data, played.distributed):
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.delitem(sys.modules, "lidarpool.datasets.torch_sweeps", raising=False)
+    monkeypatch.delitem(sys.modules, "lidarfiles.datasets.torch_sweeps", raising=False)
     yield played
-    sys.modules.pop("lidarpool.datasets.torch_sweeps", None)
+    sys.modules.pop("lidarfiles.datasets.torch_sweeps", None)

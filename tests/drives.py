@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarpool import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box
-from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.job_table import JobRow, write_table
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

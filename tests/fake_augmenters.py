@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from lidarfiles.clouds.boxes import SweepBoxes
+from lidarfiles.work.publishing import publishing
 from lidarpool.augmentation.augmented_sweep import AugmentedSweep
 from lidarpool.augmentation.rewriting.rewriter import EncodedSweeps
-from lidarpool.clouds.boxes import SweepBoxes
-from lidarpool.work.publishing import publishing
 
 INTENSITY = 0.25  # of each added point
 NAMES = ("Inserted car 1", "walker 2")

@@ -17,7 +17,7 @@ import lidarpool.report.result_pictures as pictures
 from lidarpool.__main__ import main
 from lidarsim.io.storage import Storage
 from lidarpool.processes.tracing import trace_to
-from lidarpool.datasets.dataset import DataSet
+from lidarfiles.datasets.dataset import DataSet
 from lidarpool.report.growing_cloud import CloudWriter
 from lidarpool.run.store.database import RunDatabase
 from lidarpool.run.store.run_store import RunStore

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from lidarpool.clouds.ros.messages import RosMessage, message_store
+from lidarfiles.clouds.ros.messages import RosMessage, message_store
 
 Position = tuple[float, float, float]
 # Frame, parent, position and yaw in degrees.

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.picture_file import PictureContent, sensor_positions
 from lidarpool import Actor, Column, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import SCAN
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.view import View
 
 COUNT = 30_000

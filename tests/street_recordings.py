@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarpool.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.materials import normal_incidence_energy
 

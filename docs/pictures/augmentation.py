@@ -12,17 +12,17 @@ from docs.pictures.film import BACK, RAISED, aim
 from docs.pictures.options import file_parser
 from PIL import Image, ImageDraw
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.color_table import TURBO
 from lidarpool import Fault, Pose, Scanner, load_sensor
 from lidarpool.augmentation.augmented_sweep import AugmentedSweep
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.clouds.recording import Recording
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.weather import Weather
 from lidarsim.scene.actors import box
-from lidarview.color_table import TURBO
 from lidarview.render.camera import Camera
 from lidarview.render.pictures import draw_discs
 

@@ -20,8 +20,8 @@ from benchmarks.realism import REVOLUTION_S, cases
 from docs.pictures.options import file_parser
 from PIL import Image
 
+from lidarfiles.color_table import TURBO
 from lidarscenes.procedural.city import city
-from lidarview.color_table import TURBO
 from lidarview.render.camera import Camera
 from lidarview.render.pictures import draw_discs
 from lidarview.render.surface import normalize

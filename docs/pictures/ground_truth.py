@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from lidarfiles.clouds.boxes import Boxes
 from lidarpool import read_cloud
-from lidarpool.clouds.boxes import Boxes
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import FLOW, FLOW_EGO
 from lidarsim.motion.rotations import matrices

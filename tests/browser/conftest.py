@@ -20,7 +20,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 from tests.spirals import WET, spiral, spiral_view
 from websockets.sync.client import connect
 
-from lidarpool.datasets.job_table import JobRow
+from lidarfiles.datasets.job_table import JobRow
 from lidarpool.pages.downloads import downloads
 from lidarpool.pages.job_list import JobList
 from lidarpool.pages.live_page import LivePage, live_page

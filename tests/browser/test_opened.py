@@ -12,13 +12,13 @@ from tests.drives import the_scene, the_sweeps, write_set
 from tests.packet_surveys import points_of
 from tests.shapes import room
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.picture_file import PICTURE_FILE, PictureContent
 from lidarpool import LidarError, Mounted, Pose, Survey, Track, load_sensor
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.pages import opened, recorded
 from lidarpool.pages.job_list import JobList
 from lidarpool.pages.opened import growing_view, is_data_set, open_view
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
-from lidarview.picture_file import PICTURE_FILE, PictureContent
 from lidarview.viewer.server import page_server
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
+from lidarfiles.picture_file import PictureContent, sensor_positions
 from lidarpool import Actor, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarpool.pages.downloads import downloads
 from lidarpool.pages.live_page import LivePage
@@ -19,7 +20,6 @@ from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.result_views import open_results
 from lidarview.viewer.server import page_server
 from lidarview.viewer.sharing import render_page

@@ -13,6 +13,7 @@ from distributed import Client
 from tests.chaos.target import Target
 from tests.shapes import block
 
+from lidarfiles.recordings.opening import open_sensors
 from lidarpool import (
     Actor,
     LidarError,
@@ -26,7 +27,6 @@ from lidarpool import (
 )
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.playback.pcap_recording import PcapRecording
-from lidarpool.recordings.opening import open_sensors
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from raybeam.compiled import compiled

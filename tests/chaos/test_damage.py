@@ -21,8 +21,8 @@ from tests.chaos.damage import (
 from tests.chaos.inputs import helios_target, loops_target
 from tests.drives import the_scene, the_sweeps, write_set
 
+from lidarfiles.parts.parts import part_name
 from lidarpool import LidarError
-from lidarpool.columns.parts import part_name
 from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase

@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 import lidarpool
+from lidarfiles.clouds.boxes import Boxes, SweepBoxes
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarpool import (
     Actor,
     Cloud,
@@ -23,10 +27,6 @@ from lidarpool import (
     box,
     save_cloud,
 )
-from lidarpool.clouds.boxes import Boxes, SweepBoxes
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.job_table import JobRow, write_table
 from lidarsim.io.storage import Storage
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.animation import Animation

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lidarfiles.datasets.figures import DataSetStatistics
+from lidarfiles.datasets.job_seconds import read_seconds
+from lidarfiles.datasets.job_table import JobRow
 from lidarpool import LidarError
-from lidarpool.datasets.figures import DataSetStatistics
-from lidarpool.datasets.job_seconds import read_seconds
-from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_report import write_card
 from lidarsim.io.storage import Storage
 from lidarview.render.picture_page import Page

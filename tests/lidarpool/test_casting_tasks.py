@@ -10,8 +10,8 @@ from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
 from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F401 - fixtures
 from tests.lidarsim.test_rig import TURNED, survey
 
+from lidarfiles.parts.parts import pack
 from lidarpool import Scene, box
-from lidarpool.columns.parts import pack
 from lidarpool.processes.shared_memory import Pickled
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans

@@ -16,12 +16,13 @@ from rosbags.interfaces import QosDurability
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 import lidarpool
+from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow, write_table
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.picture_file import PICTURE_FILE, PictureContent
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
-from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.job_table import JobRow, write_table
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.report.charts import draw_sweep
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.field_paths import find_field
@@ -29,7 +30,6 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarview.picture_file import PICTURE_FILE, PictureContent
 from lidarview.viewer.result_views import open_result
 
 NAMES = {3: "road", 7: "Straße", 20: "pole, or a sign at one", 299: "car"}

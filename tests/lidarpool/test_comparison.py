@@ -13,12 +13,12 @@ from pypcd4 import PointCloud
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
+from lidarfiles.clouds.recording import RayTimes
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.figures import rank_correlation
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
-from lidarpool.clouds.recording import RayTimes
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing import comparison_charts, two_clouds
-from lidarpool.datasets.figures import rank_correlation
-from lidarpool.recordings.opening import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS = 16

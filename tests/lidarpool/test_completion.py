@@ -11,8 +11,8 @@ import pytest
 from click.shell_completion import CompletionItem, ShellComplete
 from tests.plugin_files import write_distribution
 
+from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.format_table import EXPORTS, LAYOUTS
 from lidarpool.playback.bridge_table import BRIDGES
 from lidarsim.columns.table import OPTIONAL, TABLE
 from lidarsim.schema.model_names import model_names

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from tests.shapes import quad
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError, Pose, Scene, SceneMesh
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidarfiles.parts.parts import part_name
 from lidarpool import LidarError, Planning
-from lidarpool.columns.parts import part_name
 from lidarpool.plan import run_trial
 from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt

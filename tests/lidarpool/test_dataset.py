@@ -17,12 +17,12 @@ import pyarrow.dataset
 import pytest
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.dataset import INDEX_FILE, DataSet, Listing
+from lidarfiles.datasets.job_table import JobRow
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
-from lidarpool.datasets.job_table import JobRow
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -270,13 +270,13 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     with pytest.raises(LidarError, match=r"Job 0 cannot be written to .*file") as told:
         DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert "\n" not in str(told.value)
-    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarfiles.clouds.format_row.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'pip install -e "\.\[parquet\]"'):
         DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)
 
 
 def test_webdataset_has_a_sample_for_each_sweep(scene, job, sweeps, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.clouds.webdataset.MAX_SHARD_BYTES", 60_000)
+    monkeypatch.setattr("lidarfiles.clouds.webdataset.MAX_SHARD_BYTES", 60_000)
     row = JobRow(7, "hall.b", "train", {"rain": 0.5})
     places = [Storage.at(tmp_path / "here"), Storage.at((tmp_path / "there").as_uri())]
     for place in places:  # as at a URL: several ranges are written at a time

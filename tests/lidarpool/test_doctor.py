@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from lidarfiles.identity.versions import PACKAGES
 from lidarpool.cli import doctor, installed_copies
-from lidarpool.identity.versions import PACKAGES
 from lidarsim.environment.extras import CHECKOUT, install_command
 from raybeam import installation
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError
 from lidarpool.pages.opened import open_view
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_from_points
 from lidarsim.columns.sweep import Sweep
 

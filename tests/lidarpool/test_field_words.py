@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarfiles.identity.field_words import describe_changes, describe_fields
 from lidarpool import Planning
-from lidarpool.identity.field_words import describe_changes, describe_fields
 from lidarpool.run.job_source import describe_inputs
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from lidarpool.datasets.figures import DataSetStatistics, VariedQuantity, rank_correlation
-from lidarpool.datasets.job_table import JobRow
+from lidarfiles.datasets.figures import DataSetStatistics, VariedQuantity, rank_correlation
+from lidarfiles.datasets.job_table import JobRow
 
 
 def varied(values: list[object]) -> VariedQuantity:

@@ -22,10 +22,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.identity.versions import PACKAGES, software, source_hash
 from lidarpool import Beams, LidarError, Sensor, Spin
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.identity.software import describe_difference
-from lidarpool.identity.versions import PACKAGES, software, source_hash
 from lidarsim.sensor import Head
 
 Pair = namedtuple("Pair", "a b")
@@ -167,7 +167,7 @@ def test_a_function_that_ran_has_the_same():
 SCRIPT = """
 import numpy as np
 from lidarpool import Beams, Column, Pose, Sensor, Spin, Survey
-from lidarpool.identity.fingerprint import fingerprint
+from lidarfiles.identity.fingerprint import fingerprint
 from raybeam import available_backends
 
 GAIN = {"low": 0.5, "high": 2.0, "none": None}
@@ -217,7 +217,7 @@ def test_what_has_none_is_refused_by_name(thing, name):
             fingerprint(outer)
 
 
-ASK = "from lidarpool.identity.versions import source_hash; print(source_hash())"
+ASK = "from lidarfiles.identity.versions import source_hash; print(source_hash())"
 
 
 @pytest.fixture

@@ -12,6 +12,9 @@ import yaml
 from benchmarks.fit_coverage import PLACES, box, place, recorded, street, trial
 from tests.captures import IPV4, MACS, ip_packet, pcap, variants
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     LidarError,
     Noise,
@@ -26,14 +29,11 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.clouds.recording import Recording
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing.fit import search
 from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
 from lidarpool.comparing.fit.measured import SensorMeasurement
 from lidarpool.comparing.fit.smooth_surfaces import SmoothRays
-from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.models import read_model

@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from tests import simulators
 from tests.simulators import clock, joint_states, transforms
 
+from lidarfiles.clouds.ros.messages import RosMessage, message_store
 from lidarpool import (
     LidarError,
     Material,
@@ -31,7 +32,6 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.cli.follow_command import follow
-from lidarpool.clouds.ros.messages import RosMessage, message_store
 from lidarpool.following.node import FollowOptions
 from lidarpool.following.notices import Notices
 from lidarpool.following.opening import FollowSources, create_node

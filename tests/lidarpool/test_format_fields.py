@@ -23,6 +23,9 @@ from mcap_ros2.decoder import DecoderFactory
 from pypcd4.pypcd4 import PointCloud
 from tests.shapes import level, room
 
+from lidarfiles.clouds.format_table import FORMATS, load_format
+from lidarfiles.clouds.ros.layouts import LAYOUTS
+from lidarfiles.clouds.writing import ExportSpec, with_format_columns
 from lidarpool import (
     Beams,
     Fault,
@@ -38,9 +41,6 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.clouds.format_table import FORMATS, load_format
-from lidarpool.clouds.ros.layouts import LAYOUTS
-from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city

@@ -28,6 +28,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
+from lidarfiles.clouds import multi_file_format, parquet, well_known_text
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.format_table import EXPORTS, FORMATS
+from lidarfiles.clouds.ros.layouts import LAYOUTS
+from lidarfiles.clouds.well_known_text import wkt
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarpool import (
     Actor,
     Cloud,
@@ -44,13 +51,6 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.clouds import multi_file_format, parquet, well_known_text
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import EXPORTS, FORMATS
-from lidarpool.clouds.ros.layouts import LAYOUTS
-from lidarpool.clouds.well_known_text import wkt
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.open3d_access.open3d_module import load_open3d
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLORS, TABLE
@@ -557,7 +557,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
     with pytest.raises(LidarError, match=r"gone does not exist\. Create it first"):
         ExportSpec("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
-    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarfiles.clouds.format_row.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'laspy and lazrs\. Run pip install -e "\.\[las\]"'):
         ExportSpec("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
@@ -814,8 +814,8 @@ def test_classes_of_formats_need_no_optional_packages():
     packages = {package for row in FORMATS.values() for package in row.packages}
     code = (
         f"import sys; sys.modules |= dict.fromkeys({packages})\n"
-        "from lidarpool.clouds.format_table import FORMATS\n"
-        "from lidarpool.clouds.writing import ExportSpec\n"
+        "from lidarfiles.clouds.format_table import FORMATS\n"
+        "from lidarfiles.clouds.writing import ExportSpec\n"
         "assert all(ExportSpec(name).cloud_format.__name__ for name in FORMATS)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -12,8 +12,8 @@ from tests.cloud_counting import counts_of
 from tests.committing import commit
 from tests.daemons import wait_until
 
+from lidarfiles.clouds import ply
 from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
-from lidarpool.clouds import ply
 from lidarpool.report import growing_cloud
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
 from lidarpool.run.job_source import SingleJob

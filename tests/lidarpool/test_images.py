@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from tests.shapes import Cart
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import (
     Beams,
     LidarError,
@@ -26,7 +27,6 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city

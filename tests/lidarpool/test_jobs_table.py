@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lidarfiles.datasets.job_table import JobRow, Tally, read_table, write_table
 from lidarpool import Cloud, LidarError
-from lidarpool.datasets.job_table import JobRow, Tally, read_table, write_table
 from lidarsim.io.storage import Storage
 
 DONE = JobRow(

@@ -20,6 +20,8 @@ import pytest
 from tests.kills import count_changes, is_killed
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
+from lidarfiles.work import publishing, work
+from lidarfiles.work.work import FOLDER, Step
 from lidarpool import Cloud, save_cloud, twin
 from lidarpool.augmentation.effects import Effects
 from lidarpool.augmentation.running import Augmentation
@@ -35,8 +37,6 @@ from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
 from lidarpool.report.result_pictures import publish_pictures
-from lidarpool.work import publishing, work
-from lidarpool.work.work import FOLDER, Step
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
 from lidarsim.simulator.occupancy import VoxelGrid

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.packet_surveys import points_of
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import (
     Actor,
     LidarError,
@@ -19,7 +20,6 @@ from lidarpool import (
     box,
     open_recording,
 )
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.pages.opened import open_view, open_views
 
 # Height, width, length, bottom center in camera axes (right, down, forward), and rotation_y.

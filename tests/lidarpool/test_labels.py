@@ -10,8 +10,8 @@ import pytest
 import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarpool.clouds.format_table import FORMATS, load_format
-from lidarpool.clouds.writing import ExportSpec
+from lidarfiles.clouds.format_table import FORMATS, load_format
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool.pages.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, compare
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.recording import Recording
 from lidarpool.comparing import lidar4d
 from lidarpool.comparing.lidar4d import (
     WINDOWS,

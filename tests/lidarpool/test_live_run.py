@@ -18,8 +18,8 @@ from tests.committing import commit
 from tests.pages import ask
 from tests.shapes import box
 
+from lidarfiles.datasets.job_table import JobRow
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
-from lidarpool.datasets.job_table import JobRow
 from lidarpool.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
 from lidarpool.pages.live_job import LiveJob
 from lidarpool.pages.live_page import LivePage, live_page

@@ -16,9 +16,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import lidarpool
+from lidarfiles.clouds.ros.bags import MCAP
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import Pose, Scene, Survey, load_sensor
-from lidarpool.clouds.ros.bags import MCAP
-from lidarpool.clouds.writing import ExportSpec
 from lidarsim.sweeps.sweeps import Sweeps
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

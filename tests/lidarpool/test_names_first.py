@@ -3,9 +3,9 @@
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene

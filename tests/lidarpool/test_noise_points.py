@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Comparison, LidarError, Scene, compare
 from lidarpool.cli.compare_command import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.pages.opened import open_view
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_from_points
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 

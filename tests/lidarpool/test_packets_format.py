@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tests.shapes import room
 
+from lidarfiles.clouds.writing import ExportSpec, with_format_columns
 from lidarpool import (
     Cloud,
     LidarError,
@@ -22,7 +23,6 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN, TABLE

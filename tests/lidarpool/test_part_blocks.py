@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarfiles.parts.part_blocks import BlockMemory, read_blocks
+from lidarfiles.parts.parts import pack, read_part
 from lidarpool import LidarError
-from lidarpool.columns.part_blocks import BlockMemory, read_blocks
-from lidarpool.columns.parts import pack, read_part
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import ALWAYS, SCAN, TABLE
 from lidarsim.io.storage import Storage

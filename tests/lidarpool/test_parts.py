@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import Cloud, LidarError
-from lidarpool.columns.parts import (
+from lidarfiles.parts.parts import (
     StoredCloud,
     deletable_files,
     mark_name,
@@ -22,6 +21,7 @@ from lidarpool.columns.parts import (
     read_part,
     unpack,
 )
+from lidarpool import Cloud, LidarError
 from lidarsim.columns.part_columns import PartColumns, cell_positions
 from lidarsim.columns.table import OPTIONAL, columns_in_parts
 from lidarsim.io.storage import Storage

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.playback import bridge as bridges
 from lidarpool.playback.bridge import Bridge
 from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry

@@ -23,6 +23,7 @@ import pytest
 from click.testing import CliRunner
 from tests.shapes import room
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import (
     Cloud,
     LidarError,
@@ -38,7 +39,6 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.playback.live_sensor import RepeatedInstruments
 from lidarpool.playback.pcap_recording import PcapRecording
 from lidarpool.playback.sources import open_source, scenario_job

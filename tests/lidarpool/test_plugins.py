@@ -8,13 +8,13 @@ import pytest
 from tests.meshes import write
 from tests.plugin_files import write_distribution
 
+from lidarfiles.clouds.format_table import format_row
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.identity.versions import plugin_versions, software
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.format_table import format_row
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.identity.software import describe_difference
-from lidarpool.identity.versions import plugin_versions, software
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points
 from lidarpool.scenario.prepare import prepare
@@ -346,7 +346,7 @@ def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, dis
 def test_the_hash_of_a_plugin_is_that_of_its_package(tmp_path):
     code = (
         "from lidarsim.environment.plugins import find_plugin\n"
-        "from lidarpool.identity.versions import plugin_versions\n"
+        "from lidarfiles.identity.versions import plugin_versions\n"
         "print(*plugin_versions([find_plugin('lidarsim.meshes', '.hashed')]).values())"
     )
     texts = {"same": "", "other": "# a comment", "again": ""}

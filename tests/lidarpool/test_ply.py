@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from tests.drives import the_scene, the_sweeps
 
+from lidarfiles.clouds import ply
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarpool import Cloud, Column, LidarError, read_cloud, save_cloud
-from lidarpool.clouds import ply
-from lidarpool.open3d_access.open3d_module import load_open3d
 from lidarsim.sweeps.sweeps import Sweeps
 
 
@@ -295,7 +295,7 @@ def test_it_comes_without_its_viewers_and_whole_to_whoever_imports_it():
     """
     code = (
         f"import sys; sys.path[:] = {sys.path}; "
-        "from lidarpool.open3d_access.open3d_module import load_open3d; o3d = load_open3d(); "
+        "from lidarfiles.open3d_access.open3d_module import load_open3d; o3d = load_open3d(); "
         "assert not {'open3d', 'dash', 'plotly'} & set(sys.modules); "
         "import open3d; assert open3d.t.geometry is o3d.t.geometry is load_open3d().t.geometry"
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.ply_rows import PlyRowEncoder
+from lidarfiles.parts.part_blocks import BlockMemory
 from lidarpool import Column, LidarError
-from lidarpool.clouds.ply_rows import PlyRowEncoder
-from lidarpool.columns.part_blocks import BlockMemory
 from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.ply_format import as_file_type, row_type
 from lidarsim.columns.table import AXES, OPTIONAL, SCAN, TABLE

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.open3d_access.open3d_module import load_open3d
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.open3d_access.open3d_module import load_open3d
 from lidarpool.pages.opened import open_view
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_from_points
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.pcd import pcd_bytes
@@ -453,7 +453,7 @@ def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):
         return scene.vertices.tolist(), reds(scene)[0].tolist(), scene.material_names, notes
 
     whole = made()
-    monkeypatch.setattr("lidarpool.clouds.las.CHUNK_POINTS", 500)
+    monkeypatch.setattr("lidarfiles.clouds.las.CHUNK_POINTS", 500)
     assert made() == whole
     vertices, red, names, notes = whole
     assert len(vertices) == 4 * (600 + 1), "the points at zero share a voxel"

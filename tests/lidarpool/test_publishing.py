@@ -11,10 +11,10 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from tests.kills import KilledError
 
-from lidarpool.clouds.folder import output_destination
+from lidarfiles.clouds.folder import output_destination
+from lidarfiles.work import publishing
+from lidarfiles.work.publishing import move_into_place
 from lidarpool.report.result_files import REPORT, obsolete_files
-from lidarpool.work import publishing
-from lidarpool.work.publishing import move_into_place
 from lidarsim.io.storage import Storage, replace_file, replacing_file, staging
 
 

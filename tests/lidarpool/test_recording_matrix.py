@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarfiles.recordings.opening import open_sensors
 from lidarpool import (
     Material,
     Scene,
@@ -24,7 +25,6 @@ from lidarpool import (
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.pages.recorded import recorded_view
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.recordings.opening import open_sensors
 from lidarpool.scenario.point_files import read_points
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN

@@ -16,6 +16,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, compare, load_trajectory, twin
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.pages.opened import open_view
@@ -24,7 +25,6 @@ from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD
 from lidarsim.io.archives import pack_arrays
 from lidarsim.scene.files.pcd import pcd_bytes

@@ -19,9 +19,9 @@ from click.testing import CliRunner
 from tests import simulators
 from tests.shapes import room
 
+from lidarfiles.clouds.ros.messages import RosMessage, message_store
 from lidarpool import Cloud, LidarError, Sensor, Survey
 from lidarpool.cli.play_command import play
-from lidarpool.clouds.ros.messages import RosMessage, message_store
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarscenes.writers.scene_file import write_scene

@@ -18,6 +18,13 @@ from rosbags.typesys.store import Typestore
 from tests.drives import points_of, the_scene, the_survey
 from tests.shapes import room
 
+from lidarfiles.clouds.format_table import LAYOUTS
+from lidarfiles.clouds.ros import layouts
+from lidarfiles.clouds.ros.bags import header_of
+from lidarfiles.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
+from lidarfiles.clouds.ros.organized import organized_rows
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     Cloud,
     LidarError,
@@ -30,13 +37,6 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import export
-from lidarpool.clouds.format_table import LAYOUTS
-from lidarpool.clouds.ros import layouts
-from lidarpool.clouds.ros.bags import header_of
-from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
-from lidarpool.clouds.ros.organized import organized_rows
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import COLORS, SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -18,9 +18,9 @@ from rerun.chunk import RrdReader
 from tests.lidarpool.test_viewers import ROOM
 from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import Cloud, LidarError, save_cloud
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.playback.sources import open_source
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses

@@ -9,6 +9,7 @@ import pytest
 from benchmarks.fit_coverage import box
 from click.testing import CliRunner
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import (
     LidarError,
     Noise,
@@ -21,7 +22,6 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.export import fired_rays
 

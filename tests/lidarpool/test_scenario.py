@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import (
     Job,
     LidarError,
@@ -26,7 +27,6 @@ from lidarpool import (
     Survey,
     box,
 )
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.demo import demo_scenario
 from lidarpool.scenario.prepare import prepare

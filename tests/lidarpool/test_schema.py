@@ -11,8 +11,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_file import is_campaign
 from lidarpool.scenario.prepare import prepare

@@ -13,8 +13,8 @@ import pytest
 from tests.drives import the_scene, the_sweeps, write_set
 
 import lidarpool
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, load_trajectory
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import livox_columns
 from lidarsim.io import allowance
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import growing_view, open_view
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_from_points
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

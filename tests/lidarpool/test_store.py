@@ -16,9 +16,9 @@ from tests.committing import commit
 
 import lidarpool.run.store.remote
 import lidarpool.run.store.run_store
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.parts.parts import mark_name, part_name, probe_name
 from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey, remove_run
-from lidarpool.columns.parts import mark_name, part_name, probe_name
-from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
 from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore

@@ -22,12 +22,12 @@ from tests.daemons import wait_until
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.format_table import DATA_SETS, LAYOUTS, load_format
+from lidarfiles.datasets.dataset import INDEX_FILE, DataSet
+from lidarfiles.datasets.job_table import JobRow, write_table
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, Scene, Sweep
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS, load_format
-from lidarpool.datasets.dataset import INDEX_FILE, DataSet
-from lidarpool.datasets.job_table import JobRow, write_table
-from lidarpool.recordings.opening import open_recording
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -241,7 +241,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     index.unlink()
     told(lambda: lidarpool.sweeps(place), "contains an unfinished data set.*--resume")
     written("parquet"), written("mcap")
-    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarfiles.clouds.format_row.find_spec", lambda name: None)
     told(lambda: lidarpool.sweeps(written("parquet")), r'pip install -e "\.\[parquet\]"')
     told(lambda: lidarpool.sweeps(written("mcap")), r'pip install -e "\.\[ros\]"')
 
@@ -408,7 +408,7 @@ def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, w
 
 
 def test_without_torch(written, monkeypatch):
-    monkeypatch.setattr("lidarpool.datasets.loader.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarfiles.datasets.loader.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r"requires PyTorch\. Run pip install torch"):
         lidarpool.sweeps(written("kitti")).torch()
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from tests.shapes import cast_between, made
 
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.picture_file import PictureContent
 from lidarpool import (
     Actor,
     Cloud,
@@ -24,7 +26,6 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
@@ -33,7 +34,6 @@ from lidarsim.casting.surfaces import SceneSurfaces
 from lidarsim.io import allowance
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]

@@ -14,6 +14,10 @@ from click.testing import CliRunner
 from scipy.spatial import cKDTree
 from tests.simulated_drives import simulated_drive, simulated_points
 
+from lidarfiles.clouds.point_times import PointTimes
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.rings import Rings
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     Actor,
     LidarError,
@@ -31,15 +35,11 @@ from lidarpool import (
     twin,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.point_times import PointTimes
-from lidarpool.clouds.recording import Recording
-from lidarpool.clouds.rings import Rings
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scan_patterns.lasers import RingLasers
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

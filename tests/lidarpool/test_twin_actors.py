@@ -9,15 +9,15 @@ import pytest
 from tests.city_drives import CARS, car_drive, car_position
 from tests.drives import points_of, the_scene, the_survey
 
+from lidarfiles.clouds.recorded_boxes import RecordedBoxes
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, save_cloud, twin
-from lidarpool.clouds.recorded_boxes import RecordedBoxes
-from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.moving_objects import find_tracks
 from lidarpool.reconstruction.moving_rays import MovingRays, SweepMasks
 from lidarpool.reconstruction.object_clusters import find_clusters
 from lidarpool.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
 from lidarpool.reconstruction.object_tracks import ObjectTrack
-from lidarpool.recordings.opening import open_recording
 from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.sweeps.sweeps import Sweeps
 

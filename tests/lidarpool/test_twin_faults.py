@@ -18,13 +18,13 @@ from distributed import Client
 from tests.city_drives import write_city_drive
 from tests.clusters import thread_cluster
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.work.lost_workers import LostWorkersError
+from lidarfiles.work.mapping import parallel_map
+from lidarfiles.work.work import FOLDER
 from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.folder import result_folder
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.work.lost_workers import LostWorkersError
-from lidarpool.work.mapping import parallel_map
-from lidarpool.work.work import FOLDER
 
 pytest.importorskip("scipy")
 

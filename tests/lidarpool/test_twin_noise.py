@@ -9,8 +9,9 @@ import pytest
 import yaml
 from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_lasers
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import Sensor, load_sensor, twin
-from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, align
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
@@ -18,7 +19,6 @@ from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.range_noise import estimate_range_noise
 from lidarpool.reconstruction.recorded_sensor import SweepTiming
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.recordings.opening import open_recording
 from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError
-from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarpool.reconstruction.blocked_directions import BlockedDirections
 from lidarpool.reconstruction.lost_pulses import SensorCoverage

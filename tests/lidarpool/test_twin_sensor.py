@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidarpool.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording
 from lidarpool.reconstruction import recorded_sensor
 from lidarpool.reconstruction.air_returns import AirStatistics, find_air_returns
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarpool.clouds.recorded_boxes import RecordedBoxes
+from lidarfiles.clouds.recorded_boxes import RecordedBoxes
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.moving_objects import LabeledTracks, find_tracks

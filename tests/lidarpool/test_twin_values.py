@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lidarpool.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweep, Alignment
 from lidarpool.reconstruction.blocked_directions import PulseCounts
 from lidarpool.reconstruction.free_space import RangeImage, find_stationary_points, locate

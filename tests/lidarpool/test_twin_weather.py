@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.simulated_drives import simulated_drive
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     Actor,
     Material,
@@ -31,7 +32,6 @@ from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 

@@ -17,6 +17,8 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.foxglove_client import FoxgloveClient, numbers, records, stamp_ns
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.shown_sweeps import ShownSweep, Surroundings
 from lidarpool import (
     Actor,
     Foxglove,
@@ -35,8 +37,6 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.shown_sweeps import ShownSweep, Surroundings
 from lidarpool.playback.bridge import BridgeOptions, bridge_class
 from lidarpool.playback.schedule import Schedule
 from lidarpool.playback.sources import open_source

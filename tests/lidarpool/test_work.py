@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from tests.kills import is_killed
 
-from lidarpool.work import publishing
-from lidarpool.work.publishing import move_into_place
-from lidarpool.work.work import FOLDER, FileStep, Inputs, Step, Work, link_files
+from lidarfiles.work import publishing
+from lidarfiles.work.publishing import move_into_place
+from lidarfiles.work.work import FOLDER, FileStep, Inputs, Step, Work, link_files
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 

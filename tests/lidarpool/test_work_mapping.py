@@ -14,8 +14,8 @@ import numpy as np
 import psutil
 import pytest
 
-from lidarpool.work.lost_workers import LostWorkersError
-from lidarpool.work.mapping import parallel_map
+from lidarfiles.work.lost_workers import LostWorkersError
+from lidarfiles.work.mapping import parallel_map
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ def test_no_process_is_left_when_the_map_is_abandoned():
 
 SCRIPT = """
 import time
-from lidarpool.work.mapping import parallel_map
+from lidarfiles.work.mapping import parallel_map
 print("started once", flush=True)
 with parallel_map(None, 4, 1, workers=2) as run:
     for item in run(lambda item: time.sleep(600 * item) or item, [0, 1, 1]):
@@ -214,7 +214,7 @@ def test_processes_end_with_the_process_that_has_started_them(tmp_path):
 
 
 def test_a_map_on_this_machine_imports_no_dask():
-    code = "import lidarpool.work.process_pool, sys; print('dask' in sys.modules)"
+    code = "import lidarfiles.work.process_pool, sys; print('dask' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
 

@@ -13,10 +13,10 @@ import yaml
 from click.testing import CliRunner
 from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
 
+from lidarfiles.clouds.las_header import las_system
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.las_header import las_system
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.pages.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.empty_cloud import empty_cloud_reason

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from lidarfiles.datasets.dataset import DataSet
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.datasets.dataset import DataSet
 from lidarpool.run import writer
 from lidarpool.run.cluster.checks import check_workers
 from lidarpool.run.pipeline.failures import JobError

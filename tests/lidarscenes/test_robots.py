@@ -11,8 +11,8 @@ import pytest
 from tests.lidarsim.test_moving import stored_positions
 from tests.shapes import level, made
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

@@ -10,8 +10,9 @@ import pytest
 from tests.meshes import write
 from tests.shapes import made
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.picture_file import PictureContent
 from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.clouds.boxes import Boxes
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
@@ -22,7 +23,6 @@ from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.wheels import animate_wheels
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 
 KINDS = {"f": 5126, "B": 5121, "H": 5123}
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}

@@ -14,8 +14,8 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from lidarfiles.recordings.opening import open_recording
 from lidarpool.cli.commands import cli
-from lidarpool.recordings.opening import open_recording
 from lidarsim import LidarError, load_sensor
 
 DEEP = 100_000

@@ -12,6 +12,13 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tests.shapes import block, wall
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.images import RayImage
+from lidarfiles.clouds.ros.bags import Rosbag2
+from lidarfiles.clouds.webdataset import WebDataset
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.datasets.sweep_data import sweep_of_job
 from lidarpool import (
     Actor,
     Fault,
@@ -26,13 +33,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.images import RayImage
-from lidarpool.clouds.ros.bags import Rosbag2
-from lidarpool.clouds.webdataset import WebDataset
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.datasets.job_table import JobRow
-from lidarpool.datasets.sweep_data import sweep_of_job
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

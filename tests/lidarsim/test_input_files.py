@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from lidarfiles.clouds.format_table import point_suffixes
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
-from lidarpool.clouds.format_table import point_suffixes
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import scene_from_points, surfel_mesh
 from lidarpool.scenario.prepare import prepare

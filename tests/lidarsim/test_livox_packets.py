@@ -13,6 +13,7 @@ import pytest
 from tests.packet_surveys import encoded, payloads_to, points_of
 from tests.shapes import Cart, box, room, wall
 
+from lidarfiles.clouds.navigation_files import write_instruments
 from lidarpool import (
     Fault,
     Imu,
@@ -26,7 +27,6 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.clouds.navigation_files import write_instruments
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model

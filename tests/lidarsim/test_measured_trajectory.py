@@ -9,6 +9,7 @@ import pytest
 from tests.shapes import cast_between, level
 from tests.simulated_drives import simulated_points
 
+from lidarfiles.clouds.navigation_files import write_instruments
 from lidarpool import (
     Gnss,
     Imu,
@@ -21,7 +22,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.clouds.navigation_files import write_instruments
 from lidarsim.motion.navigation import gnss_fixes
 from lidarsim.motion.trajectory_files import load_trajectory
 from lidarsim.simulator.rig import Rig

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from lidarfiles.clouds.navigation_files import instrument_bytes, write_instruments
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import (
     Cloud,
     Gnss,
@@ -25,8 +27,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

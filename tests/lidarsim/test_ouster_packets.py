@@ -16,6 +16,8 @@ import pytest
 from tests.captures import variants
 from tests.shapes import Cart, box, room, wall
 
+from lidarfiles.clouds.navigation_files import write_instruments
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import (
     Fault,
     Imu,
@@ -31,8 +33,6 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.clouds.navigation_files import write_instruments
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.ouster import LIDAR_PORT, PROFILES, OusterDecoder

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.shapes import Cart, cast_between, tally_of
 
+from lidarfiles.parts.parts import pack
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
-from lidarpool.columns.parts import pack
 from lidarsim import box
 from lidarsim.casting import static_bodies
 from lidarsim.scene.shapes import seed_objects

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.shapes import level
 
+from lidarfiles.parts.parts import pack
 from lidarpool import (
     Actor,
     Material,
@@ -21,7 +22,6 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.columns.parts import pack
 from lidarsim import box
 from lidarsim.casting import static_bodies
 from lidarsim.casting.clipping import box_planes, clip_triangles

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.shapes import Cart
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import (
     Beams,
     LidarError,
@@ -26,7 +27,6 @@ from lidarpool import (
     load_sensor,
     load_trajectory,
 )
-from lidarpool.identity.fingerprint import fingerprint
 from lidarsim.motion.rotations import matrices, quaternions_of, rotations_of
 from lidarsim.motion.trajectory import velocities
 from lidarsim.survey.survey import MAX_STEPS

@@ -12,6 +12,14 @@ import pytest
 import trimesh
 from matplotlib import colormaps
 
+from lidarfiles.picture_file import (
+    PICTURE_FILE,
+    PictureContent,
+    PlannedPath,
+    PlanningPicture,
+    SensorPositions,
+    sensor_positions,
+)
 from lidarpool import (
     Actor,
     Cloud,
@@ -35,14 +43,6 @@ from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Z
 from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarview.picture_file import (
-    PICTURE_FILE,
-    PictureContent,
-    PlannedPath,
-    PlanningPicture,
-    SensorPositions,
-    sensor_positions,
-)
 from lidarview.render.coloring import make_coloring
 from lidarview.viewer import point_selection as points
 from lidarview.viewer.display_mesh import DisplayMesh, available_colorings
@@ -423,7 +423,7 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
     pytest.importorskip({"las": "laspy", "parquet": "pyarrow"}.get(kind, "numpy"))
     result = result_in(tmp_path / "one", spun)
     with monkeypatch.context() as without:
-        without.setattr("lidarpool.clouds.format_row.find_spec", lambda package: None)
+        without.setattr("lidarfiles.clouds.format_row.find_spec", lambda package: None)
         view = open_views([result])
         assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
     view = open_views([result])

@@ -11,6 +11,7 @@ import click
 import numpy as np
 import pytest
 
+from lidarfiles.picture_file import PICTURE_FILE, PictureContent, SensorPositions, sensor_positions
 from lidarpool import (
     Actor,
     Cloud,
@@ -33,7 +34,6 @@ from lidarpool.plan.trial import run_trial
 from lidarpool.report.picture_content import planning_picture
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
-from lidarview.picture_file import PICTURE_FILE, PictureContent, SensorPositions, sensor_positions
 from lidarview.render.picture_page import Page
 
 SMALL = ("--size", "480x480")

@@ -20,6 +20,7 @@ from matplotlib.text import Text
 from PIL import Image
 from tests.shapes import block, level, quad
 
+from lidarfiles.color_table import TURBO
 from lidarpool import Cloud, Column, LidarError, Planning, Scene, SceneMesh, box
 from lidarpool.plan import best, run_trial
 from lidarpool.report.picture_content import planning_picture
@@ -27,7 +28,6 @@ from lidarpool.report.result_pictures import draw_path
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.words import shorten_name
-from lidarview.color_table import TURBO
 from lidarview.render.coloring import make_coloring
 from lidarview.render.hit_density import hit_density
 from lidarview.render.picture_page import Page

@@ -356,7 +356,7 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 """
 ANOTHER_PYTHON = "import platform; platform.python_version = lambda: '3.99.1'"
-OTHER_SOURCES = "import lidarpool.identity.versions as s; s.source_hash = lambda: '12345678'"
+OTHER_SOURCES = "import lidarfiles.identity.versions as s; s.source_hash = lambda: '12345678'"
 
 
 @pytest.mark.extended

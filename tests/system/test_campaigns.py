@@ -22,6 +22,10 @@ from tests.killed_drivers import drive
 
 import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
+from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.identity.sealed import seal_json, unseal_json
 from lidarpool import (
     Campaign,
     Job,
@@ -34,10 +38,6 @@ from lidarpool import (
     simulate,
     sweeps,
 )
-from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.job_table import JobRow
-from lidarpool.identity.sealed import seal_json, unseal_json
 from lidarpool.report.campaign_output import verify_dataset
 from lidarpool.run.progress import Progress
 from lidarsim.errors import explain_os_errors

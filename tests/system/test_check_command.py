@@ -260,7 +260,7 @@ def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
     said = json.loads(check("--json", text=exported).out)
     least = 2 * 20 * said["estimate"]["points"]
     assert said["disk"]["result"] > plain["disk"]["result"] + least
-    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarfiles.clouds.format_row.find_spec", lambda name: None)
     outcome = check(text=exported)
     assert outcome.code == 2
     assert (

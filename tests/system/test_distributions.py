@@ -125,7 +125,7 @@ WITH_OTHERS = {
 OPTIONAL = {
     "DracoPy": ("lidarsim/scene/files/gltf_draco.py",),
     "IPython": ("lidarsim/environment/notebook.py",),
-    "betterosi": ("lidarpool/clouds/osi.py", "lidarpool/scenario/osi_trace.py"),
+    "betterosi": ("lidarfiles/clouds/osi.py", "lidarpool/scenario/osi_trace.py"),
     "cuda": ("raybeam/cuda_backend.py",),
     "cupy": ("raybeam/cuda_backend.py",),
     "cyclonedds": ("lidarpool/playback/dds.py", "lidarpool/playback/serialized_topics.py"),
@@ -135,8 +135,8 @@ OPTIONAL = {
     "grpc": ("lidarpool/serving/",),
     "ifcopenshell": ("lidarscenes/files/ifc_child.py",),
     "kr8s": ("poolpart/deploy/kubernetes.py",),
-    "laspy": ("lidarpool/clouds/las",),
-    "lazrs": ("lidarpool/clouds/las",),
+    "laspy": ("lidarfiles/clouds/las",),
+    "lazrs": ("lidarfiles/clouds/las",),
     "llvmlite": ("raybeam/",),  # comes with numba
     "lpips": ("lidarpool/comparing/lidar4d.py",),
     "lz4": ("lidarpool/augmentation/rewriting/mcap_copy.py",),  # comes with rosbags
@@ -148,24 +148,24 @@ OPTIONAL = {
     "pxr": ("lidarscenes/files/usd_child.py", "lidarscenes/sensors/omnilidar_child.py"),
     "py4dgeo": ("lidarpool/comparing/surveys/m3c2.py",),
     "pyarrow": (
-        "lidarpool/clouds/parquet", "lidarpool/datasets/job_table.py",
+        "lidarfiles/clouds/parquet", "lidarfiles/datasets/job_table.py",
         "lidarsim/sensor_files/ray_parquet.py",
     ),
-    "pye57": ("lidarpool/clouds/e57",),
+    "pye57": ("lidarfiles/clouds/e57",),
     "rasterio": (
-        "lidarpool/clouds/navigation_files.py", "lidarpool/clouds/well_known_text.py",
+        "lidarfiles/clouds/navigation_files.py", "lidarfiles/clouds/well_known_text.py",
         "lidarpool/plan/flight_area.py", "lidarscenes/files/rasters.py",
         "lidarsim/scene/files/coordinate_systems.py", "lidarsim/scene/files/stated_system.py",
     ),
-    "rerun": ("lidarpool/clouds/rrd.py", "lidarpool/viewers/rerun_server.py"),
+    "rerun": ("lidarfiles/clouds/rrd.py", "lidarpool/viewers/rerun_server.py"),
     "rosbags": (
-        "lidarpool/augmentation/rewriting/bag_rewriter.py", "lidarpool/clouds/ros/",
+        "lidarpool/augmentation/rewriting/bag_rewriter.py", "lidarfiles/clouds/ros/",
         "lidarpool/following/pose_input.py", "lidarpool/playback/dds.py",
         "lidarsim/columns/bags.py", "lidarsim/columns/closing_bag.py",
     ),
     "shapely": ("lidarpool/plan/flight_",),
     "small_gicp": ("lidarpool/reconstruction/odometry.py",),
-    "torch": ("lidarpool/comparing/lidar4d.py", "lidarpool/datasets/torch_sweeps.py"),
+    "torch": ("lidarpool/comparing/lidar4d.py", "lidarfiles/datasets/torch_sweeps.py"),
     "velodyne_decoder": ("lidarsim/packets/velodyne.py",),
 }  # fmt: skip
 

@@ -42,10 +42,10 @@ import lidarsim
 import lidarsim.packets
 import poolpart
 import raybeam
+from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
+from lidarfiles.datasets.dataset import DATA_SETS
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
-from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.mount_sections import VehicleFile
 from lidarpool.scenario.plausibility import plausibility_warnings

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from lidarfiles.clouds import multi_file_format
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
-from lidarpool.clouds import multi_file_format
-from lidarpool.clouds.folder import result_folder
-from lidarpool.clouds.writing import ExportSpec
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarpool.clouds.folder import result_folder
+from lidarfiles.clouds.folder import result_folder
 from lidarpool.report.result_files import FILES
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
@@ -19,7 +19,7 @@ SCRIPT = """
 import json, os, signal, sys
 from pathlib import Path
 from lidarpool.report.result_files import REPORT, obsolete_files
-from lidarpool.work.publishing import move_into_place
+from lidarfiles.work.publishing import move_into_place
 
 root, files, earlier = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 

@@ -20,10 +20,10 @@ from tests.system.test_resume import SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
-from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.columns.parts import unpack
-from lidarpool.datasets.dataset import job_file
-from lidarpool.datasets.job_table import JobRow
+from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.datasets.dataset import job_file
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.parts.parts import unpack
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.io.storage import Storage

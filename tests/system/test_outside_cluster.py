@@ -54,7 +54,9 @@ def test_a_worker_whose_backend_gives_other_bits_casts_nothing(outside, cluster_
     expected = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="numpy")
     cluster = outside()
     ours = [cluster.add(("GPU", 1)), cluster.add(("GPU", 1))]
-    preload = "import lidarpool.identity.versions as s; s.backend_versions = lambda name: 'by hand'"
+    preload = (
+        "import lidarfiles.identity.versions as s; s.backend_versions = lambda name: 'by hand'"
+    )
     other = cluster.add(("GPU", 1), preload=preload)
     cluster.add(("LIDAR", 4))
     cluster.wait()
@@ -76,7 +78,7 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
     lidar = cluster.add(("LIDAR", 4))
     cluster.add(("OTHER", 1))
     cluster.wait()
-    preload = "import lidarpool.identity.versions as s; s.source_hash = lambda: '12345678'"
+    preload = "import lidarfiles.identity.versions as s; s.source_hash = lambda: '12345678'"
 
     def on_frame(frame: ScanFrame) -> None:
         if frame.scan == 10:

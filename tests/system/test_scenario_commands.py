@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool.cli.commands import cli
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 

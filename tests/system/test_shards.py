@@ -16,10 +16,10 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 
+from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.datasets.job_seconds import read_seconds
+from lidarfiles.identity.sealed import seal_json, unseal_json
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps
-from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.datasets.job_seconds import read_seconds
-from lidarpool.identity.sealed import seal_json, unseal_json
 from lidarpool.identity.shard import Shard
 from lidarpool.report.campaign_output import verify_dataset
 from lidarsim.io.storage import Storage
@@ -554,7 +554,7 @@ KILLED = """
 import json, os, signal, sys
 from lidarpool import merge
 from lidarsim.io.storage import Storage
-from lidarpool.datasets.job_table import read_table
+from lidarfiles.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
 owners = {"copy_from": Storage, "write_table": output, "finish": output.DataSet}
 def die_at(name, number):

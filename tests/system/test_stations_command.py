@@ -9,7 +9,7 @@ import trimesh
 import yaml
 from PIL import Image
 
-from lidarpool.clouds.folder import result_folder
+from lidarfiles.clouds.folder import result_folder
 from lidarpool.report.result_pictures import COLORS, COVERED, OTHER, UNCOVERED
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

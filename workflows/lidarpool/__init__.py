@@ -7,6 +7,12 @@ import lidarview  # noqa: F401 - draws the pictures in notebooks
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
+    from lidarfiles.clouds.open3d_cloud import to_open3d
+    from lidarfiles.clouds.ply import read_cloud
+    from lidarfiles.clouds.recording import Recording
+    from lidarfiles.clouds.writing import save_cloud
+    from lidarfiles.datasets.loader import sweeps
+    from lidarfiles.recordings.opening import open_recording
     from lidarscenes.robots.robot import Robot
     from lidarscenes.robots.urdf import load_robot
     from lidarsim.columns.cloud import Cloud
@@ -35,21 +41,15 @@ if TYPE_CHECKING:
     from .api.simulation import Campaign, simulate
     from .augmentation.effects import Effects, Insertion
     from .augmentation.transform import Augment, augment
-    from .clouds.open3d_cloud import to_open3d
-    from .clouds.ply import read_cloud
-    from .clouds.recording import Recording
-    from .clouds.writing import save_cloud
     from .comparing.comparison import Comparison
     from .comparing.fit.fitting import Fit, fit
     from .comparing.surveys import SurveyComparison, compare_strips, compare_surveys
     from .comparing.two_clouds import compare
-    from .datasets.loader import sweeps
     from .pages.scanner_page import show
     from .plan import Plan, Planning
     from .playback.live import play
     from .reconstruction.building import twin
     from .reconstruction.twin import Twin
-    from .recordings.opening import open_recording
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from PIL import Image
 
+from lidarfiles.picture_file import SensorPositions, sensor_positions
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.table import Z
 from lidarsim.environment.notebook import PICTURE_SIZE
@@ -23,7 +24,6 @@ from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.words import plural
 
-from .picture_file import SensorPositions, sensor_positions
 from .render import theme
 from .render.beam_picture import beam_page
 from .render.camera import fit_camera

@@ -13,8 +13,8 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import Material, Noise, Survey, load_sensor
-from lidarpool.clouds.writing import ExportSpec
 from lidarscenes.procedural.city import city
 from lidarsim.scene.scene import Scene
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarpool.clouds.writing import ExportSpec
+from lidarfiles.clouds.writing import ExportSpec
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ from functools import partial
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import Fault, Pose, Scanner, Scene, Track, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.insertions import load_insertion
 from lidarpool.augmentation.object_classes import find_class
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError

@@ -25,11 +25,11 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.ros.messages import message_store
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting import bag_rewriter
 from lidarpool.augmentation.rewriting.opening import open_rewriter
-from lidarpool.clouds.ros.messages import message_store
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, point_columns
 
 TOPIC = "/front/points"

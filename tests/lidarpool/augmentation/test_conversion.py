@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, read_cloud
 from lidarpool.augmentation.augmented_sweep import AugmentedSweep
 from lidarpool.augmentation.conversion import open_converter
 from lidarpool.augmentation.rewriting.opening import open_rewriter
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.recordings.opening import open_recording
 
 
 def converter(path, spec, sensor=None):

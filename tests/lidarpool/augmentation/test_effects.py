@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.insertions import load_insertion
-from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import Weather

@@ -15,10 +15,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import Material, Noise, Pose, Scanner, Scene, Survey, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene_mesh import SceneMesh

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from tests.drives import SCANS, points_of, the_scene
 from tests.street_recordings import COUNT, record, reflectances, street
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import load_sensor
 from lidarpool.augmentation.intensity_fit import (
     NearFactors,
@@ -21,8 +23,6 @@ from lidarpool.augmentation.intensity_fit import (
     is_compensated,
 )
 from lidarpool.augmentation.intensity_scale import IntensityScale
-from lidarpool.clouds.recording import Recording
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import normal_incidence_energy

@@ -19,10 +19,10 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.opening import open_rewriter
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.recordings.opening import open_recording
 
 P2 = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
 

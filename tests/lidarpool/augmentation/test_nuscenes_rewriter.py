@@ -19,11 +19,11 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.nuscenes_categories import visibility_token
 from lidarpool.augmentation.rewriting.opening import open_rewriter
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.recordings.opening import open_recording
 from lidarsim.motion.rotations import matrices
 
 CLASSES = {3: "road", 7: "Car"}

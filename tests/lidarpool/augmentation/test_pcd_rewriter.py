@@ -11,10 +11,10 @@ from hypothesis.extra.numpy import arrays
 from tests.drives import points_of, the_scene, the_sweeps
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.augmentation.rewriting.stored_records import StoredRecords, convert_values
-from lidarpool.clouds.writing import ExportSpec
-from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.files.lzf_loops import pack_lzf, packed_limit, unpack_lzf
 from lidarsim.scene.files.pcd import PCDRecords, read_pcd

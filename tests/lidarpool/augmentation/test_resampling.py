@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, Sensor, load_sensor
 from lidarpool.augmentation.resampling import SensorResampler
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 
 # Distances of the walls, the floor and the ceiling from the sensor, which is not in the center.

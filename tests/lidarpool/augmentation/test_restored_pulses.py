@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import Noise, Scanner, Scene, Track, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects
 from lidarpool.augmentation.scan_pattern import ScanPattern
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.weather import Weather

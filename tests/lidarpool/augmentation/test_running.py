@@ -15,12 +15,12 @@ from distributed import Client
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
 import poolpart.deploy
+from lidarfiles.work.work import FOLDER, Work
 from lidarpool import LidarError, box, load_sensor, open_recording
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.running import WORK_SUFFIX, Augmentation
 from lidarpool.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
 from lidarpool.augmentation.variants import CampaignVariants, Variants
-from lidarpool.work.work import FOLDER, Work
 from lidarsim.io.storage import Storage
 
 SWEEPS = 8
@@ -234,7 +234,7 @@ def test_other_software_is_refused(augmentation, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         augmentation.run(out, workers=1, progress=stop_after(2))
     other = {"lidarpool": "0.0 (sources 1)"}
-    monkeypatch.setattr("lidarpool.work.work.software", lambda: other)
+    monkeypatch.setattr("lidarfiles.work.work.software", lambda: other)
     with pytest.raises(LidarError, match=r"different inputs \(version of lidarpool\)"):
         augmentation.run(out, workers=1, resume=True)
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, box
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.ground_plane import GroundPlane
 from lidarpool.augmentation.inserted_objects import InsertedObjects
 from lidarpool.augmentation.sensor_motion import SensorMotion
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import rotations_of
 

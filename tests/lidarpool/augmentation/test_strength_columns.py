@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.street_recordings import record, reflectances
 
+from lidarfiles.clouds.recording import Recording
 from lidarpool import load_sensor
 from lidarpool.augmentation.detection_threshold import detection_threshold
 from lidarpool.augmentation.intensity_scale import IntensityScale
 from lidarpool.augmentation.strength_columns import StrengthColumns
-from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.reflectivity import SCALES
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
+from lidarfiles.clouds.boxes import SweepBoxes
 from lidarpool import (
     Actor,
     Augment,
@@ -24,7 +25,6 @@ from lidarpool import (
     open_recording,
 )
 from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.clouds.boxes import SweepBoxes
 
 RAIN = {"rain_mm_h": 50, "visibility_km": 0.2}
 COLUMNS = ("intensity", "ring")

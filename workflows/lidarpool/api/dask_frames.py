@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from lidarfiles.parts.parts import StoredCloud, read_part
 from lidarsim.columns.cloud import require_packages
 from lidarsim.schema.checks import check_type
-
-from ..columns.parts import StoredCloud, read_part
 
 
 def to_dask(points: StoredCloud) -> Any:

@@ -12,15 +12,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.clouds.writing import save_cloud
 from lidarsim.environment.notebook import PICTURE_SIZE, cell_display, html_image, html_table
 from lidarsim.schema.checks import check_fits, check_list
 from lidarsim.words import format_scan_counts, plural
 
-from ..clouds.writing import save_cloud
 from ..run.run_result import RunResult
 
 if TYPE_CHECKING:
-    from lidarview.picture_file import PictureContent
+    from lidarfiles.picture_file import PictureContent
 
 _NOTEBOOK_PICTURES = ("hits", "cloud")
 
@@ -71,8 +71,9 @@ class Result(RunResult):
             If a file cannot be written, if the folder contains the result of a different survey, or
             if a format requires a missing package or column.
         """
-        from ..clouds.folder import output_destination
-        from ..clouds.writing import ExportSpec
+        from lidarfiles.clouds.folder import output_destination
+        from lidarfiles.clouds.writing import ExportSpec
+
         from ..report.output import SurveyOutput
 
         check_list("formats", formats)

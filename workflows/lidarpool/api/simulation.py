@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Unpack
 
+from lidarfiles.clouds.folder import output_destination
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
@@ -15,7 +16,6 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.survey.survey import Survey
 from lidarsim.words import did_you_mean
 
-from ..clouds.folder import output_destination
 from ..identity.shard import Shard
 from ..pages import page_of
 from ..plan import Planning

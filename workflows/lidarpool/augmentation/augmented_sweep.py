@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from lidarfiles.clouds.boxes import SweepBoxes
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
-
-from ..clouds.boxes import SweepBoxes
 
 
 def _no_boxes() -> SweepBoxes:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -17,7 +18,6 @@ from lidarsim.pulses.steps.step import RecordedPulses
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, RecordedSensor
 
-from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects

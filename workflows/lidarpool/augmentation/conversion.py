@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.parts.parts import StoredCloud, pack
 from lidarsim.columns.column_names import COLORS, TIMES
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.sweep import Sweep
@@ -24,9 +27,6 @@ from lidarsim.sweeps.lidar_traits import LidarTraits
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps, actor_type
 from lidarsim.words import join_names
 
-from ..clouds.recording import Recording, RecordingSource
-from ..clouds.writing import ExportSpec
-from ..columns.parts import StoredCloud, pack
 from .augmented_sweep import AugmentedSweep
 from .rewriting.rewriter import EncodedSweeps, Rewriter, box_details, sweep_folder
 from .rewriting.stored_records import convert_values

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.boxes import SweepBoxes
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import Material
 from lidarsim.motion.rotations import quaternions_of
@@ -21,8 +23,6 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
 from lidarsim.words import did_you_mean, join_names, make_distinct, plural
 
-from ..clouds.boxes import SweepBoxes
-from ..clouds.recording import Recording
 from .effects import Effects, Insertion
 from .ground_plane import GroundPlane
 from .object_classes import find_class

@@ -12,12 +12,11 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import REFERENCE_M, normal_incidence_energy
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Bools, Floats
 from lidarsim.numerics.even_samples import even_indices
-
-from ..clouds.recording import Recording
 
 _SWEEPS = 5  # maximum number of sweeps that are read
 _MAX_RETURNS = 400_000  # maximum number of returns that are used

@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.column_names import STRENGTHS
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -21,7 +22,6 @@ from lidarsim.sensor.reflectivity import SCALES, ByteScale
 from lidarsim.sensor.sensor import Sensor
 from lidarsim.words import format_rounded
 
-from ..clouds.recording import Recording
 from .intensity_fit import (
     NearFactors,
     Quantization,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.numerics.even_samples import even_indices
 
-from ..clouds.recording import Recording
 from .scan_pattern import PulseGrid, ScanPattern
 from .sensor_motion import SensorMotion
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Ints
@@ -18,7 +19,6 @@ from lidarsim.numerics.elementary import arcsin, arctan2
 from lidarsim.sensor.sensor import Sensor
 from lidarsim.words import format_rounded, list_names, plural
 
-from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .nearest_pulse_loops import CandidateRings
 from .ring_directions import RingDirections

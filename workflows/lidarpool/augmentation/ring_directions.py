@@ -11,13 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.rings import elevations
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, to_writable
 from lidarsim.numerics.even_samples import even_indices
 
-from ..clouds.recording import Recording
-from ..clouds.rings import elevations
 from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, ring_steps
 from .nearest_pulse_loops import CandidateRings, SortedReturns, find_pulses, sort_returns
 

@@ -17,16 +17,16 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.clouds.format_table import format_of_path, formats_of_endings
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.work.mapping import MapFunction, parallel_map
+from lidarfiles.work.work import ONCE, FileStep, Inputs, Work
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.words import join_names, plural
 
-from ..clouds.folder import result_folder
-from ..clouds.format_table import format_of_path, formats_of_endings
-from ..clouds.writing import ExportSpec
-from ..work.mapping import MapFunction, parallel_map
-from ..work.work import ONCE, FileStep, Inputs, Work
 from .rewriting.data_set_copy import MARK_FILE, check_target
 from .rewriting.opening import check_sweeps
 from .sweep_tasks import (

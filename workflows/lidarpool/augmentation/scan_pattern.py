@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.rings import Rings, elevations, summarize_rings
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
@@ -23,8 +25,6 @@ from lidarsim.numerics.vectors import hypot
 from lidarsim.sensor import Sensor
 from lidarsim.words import plural
 
-from ..clouds.recording import Recording
-from ..clouds.rings import Rings, elevations, summarize_rings
 from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, stride
 from .sensor_motion import SensorMotion
 

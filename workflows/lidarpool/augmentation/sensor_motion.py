@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses
 from lidarsim.numerics.arrays import Floats
-
-from ..clouds.recording import Recording
 
 _MAX_LOCAL_M = 1e4  # distance from the origin beyond which the world frame is shifted
 

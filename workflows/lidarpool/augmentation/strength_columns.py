@@ -12,13 +12,13 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.column_names import STRENGTHS
 from lidarsim.columns.sweep import Columns
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.sensor.reflectivity import SCALES, ByteScale
 from lidarsim.sensor.sensor import Sensor
 
-from ..clouds.recording import Recording
 from .detection_threshold import DetectionThreshold, detection_threshold
 from .intensity_fit import (
     Quantization,

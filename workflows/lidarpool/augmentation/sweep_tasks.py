@@ -19,16 +19,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import open_recording
+from lidarfiles.work.mapping import describe_sweeps
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.random_numbers import named_seed
 from lidarsim.sensor import Sensor
 
-from ..clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
-from ..clouds.writing import ExportSpec
-from ..recordings.opening import open_recording
-from ..work.mapping import describe_sweeps
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
 from .conversion import FormatConverter

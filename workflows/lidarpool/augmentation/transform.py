@@ -11,6 +11,9 @@ from typing import Any, overload
 
 import numpy as np
 
+from lidarfiles.clouds.boxes import SweepBoxes
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import open_recording
 from lidarsim.columns.column_names import standard_names
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import ArgumentError, LidarError
@@ -24,9 +27,6 @@ from lidarsim.sensor import Sensor
 from lidarsim.sensor.models import load_sensor, read_model
 from lidarsim.words import did_you_mean, join_names
 
-from ..clouds.boxes import SweepBoxes
-from ..clouds.recording import Recording
-from ..recordings.opening import open_recording
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
 from .effects import Effects

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lidarfiles.datasets.job_table import Value, format_cell
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.error_sentences import convert_validation_errors
 
-from ..datasets.job_table import Value, format_cell
-from ..identity.fingerprint import fingerprint
 from ..scenario.campaign_jobs import SampledJobs, file_hashes
 from ..scenario.campaign_sections import CampaignSection, Splits
 from .effects import Effects, Insertion

@@ -299,9 +299,10 @@ def augment(
         )
     placements = _placements(settings)
     print_first_step("reading the recording", quiet=quiet)
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..augmentation.running import Augmentation
     from ..augmentation.sweep_tasks import RecordingFile
-    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

@@ -142,9 +142,10 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         print_first_step(
             f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet
         )
+        from lidarfiles.processes.freed_memory import keep_freed_memory
+
         from ..processes import timeline as steps
         from ..processes.fork_server import start_fork_server, stop_fork_server
-        from ..processes.freed_memory import keep_freed_memory
 
         if timeline is not None:
             steps.timeline.show_at_exit(timeline)

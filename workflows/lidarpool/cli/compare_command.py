@@ -186,8 +186,8 @@ def compare(
       lidarpool compare after.e57 before.e57 --survey m3c2 --points change.laz
       lidarpool compare flight.laz --survey strips --cell 2
     """  # noqa: D301 - Click requires the character \b
-    from ..processes.freed_memory import keep_freed_memory
-    from ..work.publishing import publishing
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarfiles.work.publishing import publishing
 
     if survey != STRIPS and len(others) != 1:
         if not others:

@@ -12,6 +12,7 @@ from contextlib import suppress
 import click
 from click.shell_completion import CompletionItem
 
+from lidarfiles.clouds.format_table import EXPORTS, GROUP
 from lidarsim.errors import LidarError
 from lidarsim.schema.vocabulary import (
     ALWAYS_COLUMNS,
@@ -21,7 +22,6 @@ from lidarsim.schema.vocabulary import (
 )
 from lidarsim.sensor_files.format_table import FORMATS
 
-from ..clouds.format_table import EXPORTS, GROUP
 from ..playback.bridge_table import BRIDGES
 from ..viewers.viewer_table import PAGE, VIEWERS
 

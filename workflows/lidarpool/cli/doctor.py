@@ -16,6 +16,7 @@ from dask.system import CPU_COUNT
 from distributed.system import MEMORY_LIMIT
 from packaging.requirements import Requirement
 
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarsim.environment.extras import CHECKOUT
 from lidarsim.errors import LidarError
 from poolpart import Pool, PoolError
@@ -24,7 +25,6 @@ from raybeam import available_backends
 from raybeam.compiled import HAS_CACHE
 from raybeam.installation import install_command
 
-from ..open3d_access.open3d_module import load_open3d
 from ..report.report import versions
 from ..run.cluster.requirements import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR

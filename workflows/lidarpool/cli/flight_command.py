@@ -206,9 +206,9 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     """  # noqa: D301 - Click requires the character \b
     as_json = settings.pop("as_json")
     print_first_step("reading the area", quiet=as_json)
+    from lidarfiles.clouds.folder import check_not_existing, result_folder
     from lidarsim.schema.model_names import full_name
 
-    from ..clouds.folder import check_not_existing, result_folder
     from ..plan.flight import plan_flight
     from ..plan.flight_area import read_area
     from ..plan.flight_scanner import AirborneScanner
@@ -362,12 +362,13 @@ def _write_plan(
 
     `data` is the content of the scenario, and `notes` are written to its head.
     """
+    from lidarfiles.work.publishing import publishing
+
     from ..plan.flight_density import expected_density, summarize_density
     from ..plan.flight_files import to_geojson, to_kml
     from ..report.flight_map import draw_flight
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
-    from ..work.publishing import publishing
 
     with (
         explain_os_errors(f"The plan cannot be written to {folder}", "free some disk space"),

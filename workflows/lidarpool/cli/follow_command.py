@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from ..clouds.format_table import LAYOUTS
+from lidarfiles.clouds.format_table import LAYOUTS
+
 from . import shared_options as options
 from .first_step import print_first_step
 
@@ -103,11 +104,12 @@ def follow(
     from ..playback.bridge import bridge_class
 
     bridge_class(bridge_name)  # raises an error if its packages are not installed
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..following.node import FollowOptions
     from ..following.opening import FollowSources, create_node
     from ..following.pose_input import is_wanted
     from ..playback.dds import Network, RosPublisher, RosSubscriber
-    from ..processes.freed_memory import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()

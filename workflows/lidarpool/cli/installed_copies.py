@@ -11,9 +11,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from lidarfiles.identity.versions import PACKAGES
 from lidarsim.environment.extras import install_command
-
-from ..identity.versions import PACKAGES
 
 _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 

@@ -66,9 +66,10 @@ def mount(
     options.check_workers(workers, scheduler)
     options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the vehicle", quiet=as_json)
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..mounting.study import figures_of
     from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, rank_mounts
-    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

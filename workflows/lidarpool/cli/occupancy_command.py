@@ -133,11 +133,11 @@ def occupancy(
     options.check_workers(workers, scheduler)
     options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the scene", quiet=quiet or as_json)
+    from lidarfiles.processes.freed_memory import keep_freed_memory
     from lidarsim.simulator.occupancy import VoxelGrid
 
     from ..occupancy.layouts import LAYOUTS
     from ..occupancy.writing import OccupancySettings, write_occupancy
-    from ..processes.freed_memory import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

@@ -80,7 +80,7 @@ def planned_columns(formats: Sequence[str], materials: Iterable[Material] = ()) 
     They are the range and the columns of all fields of the formats. The class is only included if a
     material has a class.
     """
-    from ..clouds.writing import ExportSpec
+    from lidarfiles.clouds.writing import ExportSpec
 
     has_classes = any(material.semantic_class for material in materials)
     names = dict.fromkeys(name for each in formats for name in ExportSpec(each).added)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..clouds.format_table import LAYOUTS
+from lidarfiles.clouds.format_table import LAYOUTS
+
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
@@ -106,13 +107,13 @@ def play(
       lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the source")
+    from lidarfiles.processes.freed_memory import keep_freed_memory
     from lidarsim.packets.capture import ENDINGS
 
     from ..playback.bridge import BridgeOptions, bridge_class
     from ..playback.player import play_sweeps
     from ..playback.schedule import Schedule
     from ..playback.sources import open_source
-    from ..processes.freed_memory import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()

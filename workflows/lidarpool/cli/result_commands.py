@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.schema.vocabulary import PICTURES
 
-from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
 from . import completion
 from . import shared_options as options
 
 if TYPE_CHECKING:
+    from lidarfiles.clouds.writing import ExportSpec
     from lidarsim.io.storage import Storage
-
-    from ..clouds.writing import ExportSpec
 
 
 def _parse_size(text: str) -> tuple[int, int]:
@@ -79,10 +78,10 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
       lidarpool plot lidarpool-out
       lidarpool plot lidarpool-out --only cloud --color intensity --size 2400x1500 --out figures
     """  # noqa: D301 - Click requires the character \b
-    from lidarview.picture_file import PICTURE_FILE, PictureContent
+    from lidarfiles.clouds.folder import local_result, path_in
+    from lidarfiles.picture_file import PICTURE_FILE, PictureContent
+    from lidarfiles.processes.freed_memory import keep_freed_memory
 
-    from ..clouds.folder import local_result, path_in
-    from ..processes.freed_memory import keep_freed_memory
     from ..report.result_files import CLOUD, PAGE
     from ..report.result_pictures import publish_pictures
 
@@ -168,14 +167,13 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - Click requires the character \b
+    from lidarfiles.clouds.folder import local_result, path_in, result_folder
+    from lidarfiles.picture_file import PICTURE_FILE, PictureContent
+    from lidarfiles.work.publishing import move_into_place
     from lidarsim.columns.cloud_file import CloudFile
     from lidarsim.io.storage import staging
     from lidarsim.sweeps.instruments import INSTRUMENT_FILES
     from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-    from lidarview.picture_file import PICTURE_FILE, PictureContent
-
-    from ..clouds.folder import local_result, path_in, result_folder
-    from ..work.publishing import move_into_place
 
     # report.json is written last, so it marks a complete result.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -222,7 +220,7 @@ def export(
 
 def _check_not_existing(target: Path | Storage, files: Sequence[str], *, overwrite: bool) -> None:
     """Raise LidarError if the target already contains a file that must not be overwritten."""
-    from ..clouds.folder import check_not_existing  # imported late to keep --help fast
+    from lidarfiles.clouds.folder import check_not_existing  # imported late to keep --help fast
 
     if isinstance(target, Path):
         check_not_existing((target / file for file in files), overwrite=overwrite)
@@ -240,7 +238,7 @@ def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> lis
 
     An option that none of the formats supports is passed to all of them, so that it is rejected.
     """
-    from ..clouds.writing import ExportSpec
+    from lidarfiles.clouds.writing import ExportSpec
 
     formats = {name: load_format(name) for name in names}
     refused = [
@@ -308,12 +306,12 @@ def view(
       lidarpool view before after
       lidarpool view drive --film drive.gif --export drive.html
     """  # noqa: D301 - Click requires the character \b
+    from lidarfiles.clouds.folder import local_result
+    from lidarfiles.picture_file import PICTURE_FILE
     from lidarsim.sweeps.sweeps import SWEEPS_FILE
-    from lidarview.picture_file import PICTURE_FILE
     from lidarview.viewer.result_views import show_view
     from lidarview.viewer.view import CLOUD
 
-    from ..clouds.folder import local_result
     from ..pages.opened import growing_view, is_data_set, open_views
 
     if film and len(results) > 1:
@@ -405,9 +403,10 @@ def fit(
       lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
       lidarpool fit --pattern recording.pcd --out mine.yaml
     """  # noqa: D301 - Click requires the character \b
-    from ..clouds.folder import check_not_existing
+    from lidarfiles.clouds.folder import check_not_existing
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..comparing.fit.fitting import fit as fitted
-    from ..processes.freed_memory import keep_freed_memory
 
     keep_freed_memory()
     if pattern:
@@ -429,9 +428,9 @@ def _fit_pattern(
     **settings: Any,
 ) -> None:
     """Estimate a scan pattern. The extension of the output file selects its form."""
+    from lidarfiles.clouds.folder import check_not_existing
     from lidarsim.sensor.models import MODEL_FILES
 
-    from ..clouds.folder import check_not_existing
     from ..scan_patterns.fitting import check_pattern_file, fit_pattern
 
     unused = [name for name, value in settings.items() if value]

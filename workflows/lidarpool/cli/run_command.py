@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lidarfiles.clouds.folder import local_result, output_destination, result_folder
+from lidarfiles.datasets.job_table import Tally, read_table
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.table import NO_SURFACE
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.words import format_scan_counts, plural
 
-from ..clouds.folder import local_result, output_destination, result_folder
-from ..datasets.job_table import Tally, read_table
 from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
@@ -205,7 +205,8 @@ def run_job(
         If the points differ, or if they cannot be compared because the data set was created with
         different software or the files of the job are damaged.
     """
-    from ..datasets.dataset import DataSet  # imported late, as in `run_campaign`
+    from lidarfiles.datasets.dataset import DataSet  # imported late, as in `run_campaign`
+
     from ..report.campaign_output import CAMPAIGN_FILE, check_same_campaign, verify_dataset
 
     target = Storage.at(out)

@@ -95,7 +95,8 @@ def serve(
     if scene is None:
         raise click.UsageError("Missing argument 'SCENE'.")
     print_first_step("reading the scene")
-    from ..processes.freed_memory import keep_freed_memory
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..serving.messages import DEVICES
     from ..serving.served_scene import load_served_scene
     from ..serving.server import Endpoint, SensorServer

@@ -168,7 +168,8 @@ def stations(
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
     print_first_step("reading the scene", quiet=settings["as_json"])
-    from ..clouds.folder import check_not_existing, result_folder
+    from lidarfiles.clouds.folder import check_not_existing, result_folder
+
     from ..scenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
@@ -199,9 +200,10 @@ def _plan(
     scenario: Scenario, model: str | None, folder: Path, as_json: bool, **settings: Any
 ) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
+    from lidarfiles.work.publishing import publishing
+
     from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
-    from ..work.publishing import publishing
     from .terminal import Terminal
 
     sensor, entry = _planned_sensor(scenario, model, folder)
@@ -268,10 +270,11 @@ def _show_coverage(
 
     The visible area is the area that can be seen from the stations of the scenario.
     """
+    from lidarfiles.recordings.opening import open_recording
+
     from ..comparing.compared_sweep import compared_in_world
     from ..comparing.stated_frames import StatedFrame, check_same_systems
     from ..plan.stations import survey_coverage
-    from ..recordings.opening import open_recording
     from .terminal import Terminal
 
     if scenario.poses is None:

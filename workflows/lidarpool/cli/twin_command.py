@@ -86,7 +86,8 @@ def twin(
       lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - Click requires the character \b
-    from ..processes.freed_memory import keep_freed_memory
+    from lidarfiles.processes.freed_memory import keep_freed_memory
+
     from ..reconstruction.building import twin as build
     from ..reconstruction.twin import SCENARIO_FILE
     from ..run.cluster.connection import connect_client

@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
-
-from ..clouds.recording import Recording
 
 RAY_KEY = "ray_key"  # column that identifies the ray and the return
 

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.work.publishing import publishing
 from lidarsim.errors import explain_os_errors
-
-from ..clouds.folder import result_folder
-from ..work.publishing import publishing
 
 if TYPE_CHECKING:
     from lidarview.render.picture_page import Page

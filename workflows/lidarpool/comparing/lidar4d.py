@@ -17,10 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from lidarfiles.open3d_access.neighbors import nearest_neighbors
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats
-
-from ..open3d_access.neighbors import nearest_neighbors
 
 PROTOCOL = "lidar4d"
 ROWS = 66

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
 from lidarsim.scene.files.stated_system import StatedSystem
-
-from ..clouds.recording import Recording
 
 
 @dataclass(frozen=True)

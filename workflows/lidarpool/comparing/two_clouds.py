@@ -12,6 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording, SeveralSensorsError
+from lidarfiles.datasets.figures import rank_correlation
+from lidarfiles.open3d_access.neighbors import nearest_neighbors
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.recordings.opening import open_recording
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
@@ -22,11 +27,6 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.words import join_names, plural
 
-from ..clouds.recording import Recording, SeveralSensorsError
-from ..columns.parts import StoredCloud
-from ..datasets.figures import rank_correlation
-from ..open3d_access.neighbors import nearest_neighbors
-from ..recordings.opening import open_recording
 from .compared_sweep import bounds_of, compared_in_world, compared_sweep, origin_to_add, rings_note
 from .comparison import Comparison
 from .comparison_data import CELLS, RESIDUALS

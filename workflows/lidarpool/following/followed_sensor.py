@@ -9,6 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.ros.layouts import MessageLayout
+from lidarfiles.clouds.ros.messages import RosMessage, SurveyMessages, static_frame
+from lidarfiles.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import quaternions_of
@@ -21,9 +24,6 @@ from lidarsim.worlds.world import WORLD, World, WorldBody, WorldFrame
 from lidarsim.worlds.world_follower import knots_ns, unseen_by
 from lidarsim.worlds.world_scanner import WorldScanner
 
-from ..clouds.ros.layouts import MessageLayout
-from ..clouds.ros.messages import RosMessage, SurveyMessages, static_frame
-from ..clouds.writing import ExportSpec, with_format_columns
 from ..scenario.sensors_file import SensorOnFrame
 
 _MAX_SPANS = 8  # spans that are kept

@@ -10,11 +10,11 @@ from typing import NoReturn, Protocol
 
 import numpy as np
 
+from lidarfiles.clouds.ros.messages import CLOCK_TOPIC, RosMessage
 from lidarsim.errors import LidarError
 from lidarsim.words import join_names, list_names, name_hint, plural
 from lidarsim.worlds.frame_tree import FrameTree
 
-from ..clouds.ros.messages import CLOCK_TOPIC, RosMessage
 from .followed_sensor import FollowedSensor
 from .notices import MAX_NAMES, Notices
 from .pose_input import PoseInput

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from lidarfiles.clouds.frame_names import frame_names
+from lidarfiles.clouds.writing import ExportSpec
 from lidarsim.errors import LidarError
 
-from ..clouds.frame_names import frame_names
-from ..clouds.writing import ExportSpec
 from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 from .followed_sensor import FollowedSensor
 from .node import FollowNode, FollowOptions, MessageSink, MessageSource

@@ -11,12 +11,12 @@ from typing import Any
 
 from rosbags.serde import SerdeError
 
+from lidarfiles.clouds.ros.messages import CLOCK_TOPIC, RosMessage, message_store
 from lidarscenes.robots.robot_world import joint_matrix
 from lidarsim.words import format_rounded
 from lidarsim.worlds.frame_tree import FrameTree, pose_of
 from lidarsim.worlds.world import WORLD
 
-from ..clouds.ros.messages import CLOCK_TOPIC, RosMessage, message_store
 from .notices import Notices
 from .world_files import RobotFrames
 

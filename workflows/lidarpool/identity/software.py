@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from lidarfiles.identity.versions import entry_name, software
 from lidarsim.environment.plugins import Plugin
 from lidarsim.errors import LidarError
-
-from .versions import entry_name, software
 
 T = TypeVar("T")
 
@@ -37,9 +36,8 @@ def software_query(
         except ModuleNotFoundError:
             return {}
         try:
+            from lidarfiles.identity.versions import software
             from lidarsim.environment.plugins import Plugin
-
-            from .versions import software
         except ModuleNotFoundError:
             return {"lidarpool": __version__}
         return software(backend, [Plugin(*fields) for fields in named])

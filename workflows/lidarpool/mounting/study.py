@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.work.mapping import MapFunction, parallel_map
+from lidarfiles.work.work import Inputs, Step, Work
 from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.road_users import ROAD_USERS
 from lidarsim.errors import LidarError, prefix_errors
@@ -22,12 +25,9 @@ from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
 from raybeam import RayCaster
 
-from ..identity.fingerprint import fingerprint
 from ..scenario.mount_sections import MAX_CELLS, BodyPart, VehicleFile
 from ..scenario.sections import ShapeSection
 from ..scenario.static_scene import FileFindings, ShapeLoader
-from ..work.mapping import MapFunction, parallel_map
-from ..work.work import Inputs, Step, Work
 from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from lidarfiles.clouds.folder import check_new_result, result_folder
+from lidarfiles.work.work import Work
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.media.weather import Weather
@@ -22,9 +24,7 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.words import printable
 from lidarview.page_templates import render_template
 
-from ..clouds.folder import check_new_result, result_folder
 from ..scenario.mount_sections import VehicleFile
-from ..work.work import Work
 from .evaluation import CONTACT_M
 from .study import MountRanking, MountStudy, figures_of, pose_entry
 

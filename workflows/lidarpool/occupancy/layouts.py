@@ -9,6 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from lidarfiles.clouds.cloud_format import Entry
+from lidarfiles.clouds.kitti import MAX_INSTANCES, first_sequence, sequence_names
+from lidarfiles.clouds.nuscenes import sample_tokens
 from lidarsim.errors import LidarError
 from lidarsim.io.archives import pack_arrays
 from lidarsim.numerics.arrays import Bools, Integers
@@ -16,9 +19,6 @@ from lidarsim.simulator.occupancy import GridFrame, Occupancy, VoxelGrid
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import list_names
 
-from ..clouds.cloud_format import Entry
-from ..clouds.kitti import MAX_INSTANCES, first_sequence, sequence_names
-from ..clouds.nuscenes import sample_tokens
 from .class_names import OCC3D_CLASSES, occ3d_class
 
 FREE_OCC3D = 17

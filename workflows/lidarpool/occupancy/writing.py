@@ -13,20 +13,20 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from lidarfiles.clouds.cloud_format import Entry
+from lidarfiles.clouds.folder import check_new_result, check_not_existing, result_folder
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.work.mapping import describe_sweeps, parallel_map
+from lidarfiles.work.work import FileStep, Inputs, Work, link_files
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGrid
 from lidarsim.words import join_names
 
-from ..clouds.cloud_format import Entry
-from ..clouds.folder import check_new_result, check_not_existing, result_folder
-from ..identity.fingerprint import fingerprint
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
-from ..work.mapping import describe_sweeps, parallel_map
-from ..work.work import FileStep, Inputs, Work, link_files
 from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:

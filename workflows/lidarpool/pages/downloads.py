@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from lidarfiles.clouds.writing import ExportSpec, save_cloud
 from lidarview.viewer.view import DownloadFormats
-
-from ..clouds.writing import ExportSpec, save_cloud
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 

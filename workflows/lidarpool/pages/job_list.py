@@ -13,6 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.format_table import data_set_title
+from lidarfiles.datasets.dataset import job_file
+from lidarfiles.datasets.job_seconds import known_seconds
+from lidarfiles.datasets.job_table import JobRow, Value, read_table
+from lidarfiles.datasets.loader import read_index, sweeps
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarsim.words import format_rounded, plural
@@ -21,11 +26,6 @@ from lidarview.viewer.result_views import wait_for_interrupt
 from lidarview.viewer.server import Answer, Arguments, announce_page, page_server
 from lidarview.viewer.view import View
 
-from ..clouds.format_table import data_set_title
-from ..datasets.dataset import job_file
-from ..datasets.job_seconds import known_seconds
-from ..datasets.job_table import JobRow, Value, read_table
-from ..datasets.loader import read_index, sweeps
 from .downloads import downloads
 from .recorded import finite_points, merge_sweeps
 

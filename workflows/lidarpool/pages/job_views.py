@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from lidarfiles.datasets.dataset import DataSet, job_file
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.viewer.result_views import open_result
 from lidarview.viewer.view import View
 
-from ..datasets.dataset import DataSet, job_file
-from ..datasets.job_table import JobRow
 from ..run.store.stored_job import StoredJob
 from .cpu_share import CpuShare
 from .downloads import downloads

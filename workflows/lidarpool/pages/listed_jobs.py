@@ -7,9 +7,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
+from lidarfiles.datasets.job_table import JobRow, Value
 from lidarsim.words import format_rounded
-
-from ..datasets.job_table import JobRow, Value
 
 LIST_EVERY_S = 0.5  # minimum time between updates of the running jobs
 # Maximum number of rows in the table.

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
 
+from lidarfiles.datasets.figures import DataSetStatistics
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.errors import LidarError
 
-from ..datasets.figures import DataSetStatistics
-from ..datasets.job_table import JobRow
 from ..report.charts import draw_results, draw_varied
 from .cpu_share import CpuShare
 

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.parts.parts import read_part
+from lidarfiles.picture_file import PictureContent
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Floats32
-from lidarview.picture_file import PictureContent
 from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import Answer
 from lidarview.viewer.view import View
 
-from ..columns.parts import read_part
 from ..plan import best
 from ..report.picture_content import planning_picture
 from ..run.pipeline.stage_messages import Receipt, ScanFrame

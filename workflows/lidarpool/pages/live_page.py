@@ -17,6 +17,8 @@ from typing import Any
 
 import click
 
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.columns.cloud_file import CloudFile
 from lidarview.viewer.result_views import wait_for_interrupt
 from lidarview.viewer.server import (
@@ -30,8 +32,6 @@ from lidarview.viewer.server import (
 )
 from poolpart import Partition
 
-from ..datasets.dataset import DataSet
-from ..datasets.job_table import JobRow
 from ..run.pipeline.stage_messages import Receipt, ScanFrame
 from ..run.progress import Progress
 from ..run.run_page import RunPage

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.datasets.dataset import INDEX_FILE
 from lidarscenes.files.formats import ROBOTS
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.input_files import open_input
@@ -20,7 +21,6 @@ from lidarsim.scene.files.text_cloud import is_text_raster
 from lidarview.viewer.result_views import join_views, open_result
 from lidarview.viewer.view import CLOUD, ProgressiveView, View
 
-from ..datasets.dataset import INDEX_FILE
 from .downloads import downloads
 
 if TYPE_CHECKING:  # The modules of recordings are only imported when a recording is opened.
@@ -141,7 +141,8 @@ def _is_previewed(path: Path) -> bool:
 
 
 def _open_recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
-    from ..recordings.opening import UnknownFormatError, open_sensors
+    from lidarfiles.recordings.opening import UnknownFormatError, open_sensors
+
     from .recorded import recorded_view
 
     may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
@@ -175,7 +176,8 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
     """
     if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
         return None
-    from ..recordings.opening import open_recording
+    from lidarfiles.recordings.opening import open_recording
+
     from . import recorded
 
     recording = open_recording(path, keep_noise=keep_noise)

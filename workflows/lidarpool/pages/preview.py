@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.picture_file import PictureContent
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, SCAN, TABLE
 from lidarsim.errors import LidarError
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from lidarview.picture_file import PictureContent
 from lidarview.viewer.point_selection import ScanOrderedPoints
 from lidarview.viewer.view import View
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.column_names import COLORS, with_standard_names
 from lidarsim.columns.sweep import Sweep
@@ -19,8 +20,6 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 from lidarsim.words import plural
 from lidarview.viewer.point_selection import STATION, InMemoryPoints, Points, ScanOrderedPoints
 from lidarview.viewer.view import DownloadFormats, LabeledObject, ProgressiveView, View
-
-from ..clouds.recording import Recording
 
 MAX_POINTS = 20_000_000  # maximum number of points of a recording in memory
 LARGE_POINTS = 2_000_000  # A sample of a larger cloud is shown while the cloud is read.

@@ -19,6 +19,7 @@ from typing import Any
 import click
 import numpy as np
 
+from lidarfiles.picture_file import PictureContent, SensorPositions
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.environment.notebook import cell_display
@@ -30,7 +31,6 @@ from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_items
 from lidarsim.simulator import Scanner
 from lidarsim.words import format_rounded
-from lidarview.picture_file import PictureContent, SensorPositions
 from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import (
     PORT,

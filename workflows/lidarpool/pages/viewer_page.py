@@ -18,12 +18,8 @@ from typing import Any
 import click
 import numpy as np
 
-from lidarsim.columns.cloud import Cloud
-from lidarsim.errors import LidarError
-from lidarview.viewer.result_views import wait_for_interrupt
-
-from ..clouds.frame_names import WORLD
-from ..clouds.shown_sweeps import (
+from lidarfiles.clouds.frame_names import WORLD
+from lidarfiles.clouds.shown_sweeps import (
     FramePose,
     ShownSweep,
     Surface,
@@ -32,8 +28,12 @@ from ..clouds.shown_sweeps import (
     path_in_world,
     viewer_columns,
 )
-from ..columns.parts import read_part
-from ..datasets.job_table import JobRow
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.parts.parts import read_part
+from lidarsim.columns.cloud import Cloud
+from lidarsim.errors import LidarError
+from lidarview.viewer.result_views import wait_for_interrupt
+
 from ..plan import best
 from ..run.pipeline.stage_messages import Receipt, ScanFrame
 from ..run.progress import Progress

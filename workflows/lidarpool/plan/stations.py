@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarfiles.open3d_access.neighbors import nearest_neighbors
 from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import match_names
@@ -21,8 +22,6 @@ from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sensor import Sensor, Spin
 from lidarsim.words import name_hint
 from raybeam import RayCaster
-
-from ..open3d_access.neighbors import nearest_neighbors
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # minimum fraction of the reachable area per station by default

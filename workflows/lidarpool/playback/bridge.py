@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar, Self
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.picture_file import PictureContent
 from lidarsim.columns.cloud import Cloud
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import did_you_mean
-from lidarview.picture_file import PictureContent
 
-from ..clouds.writing import ExportSpec
 from .bridge_table import BRIDGES
 from .schedule import Schedule
 

@@ -21,11 +21,11 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
+from lidarfiles.clouds.ros.messages import CLOCK_TOPIC, LATCHED_TOPICS, RosMessage, message_store
 from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
 from lidarsim.words import join_names, shorten_name
 
-from ..clouds.ros.messages import CLOCK_TOPIC, LATCHED_TOPICS, RosMessage, message_store
 from .serialized_topics import ANY_SAMPLE, SerializedReader, SerializedTopic, SerializedWriter
 
 LOOPBACK = "127.0.0.1"

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import count
 from typing import Any
 
+from lidarfiles.processes.freed_memory import keep_freed_memory
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import Pose, Trajectory
@@ -18,7 +19,6 @@ from lidarsim.schema.checks import check_number, check_type
 from lidarsim.simulator import Scanner
 from lidarsim.words import join_names
 
-from ..processes.freed_memory import keep_freed_memory
 from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 

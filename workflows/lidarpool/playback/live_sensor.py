@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Self
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarsim.columns.cloud import Cloud
 from lidarsim.packets.encoders import PacketEncoder, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..clouds.writing import ExportSpec
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 from .transmitter import Transmitter, sensor_streams

@@ -9,14 +9,14 @@ from heapq import merge
 from itertools import count
 from typing import Any, ClassVar, Self
 
+from lidarfiles.clouds.frame_names import survey_start_ns
+from lidarfiles.clouds.ros.layouts import MessageLayout
+from lidarfiles.clouds.ros.messages import RosMessage, SurveyMessages
+from lidarfiles.clouds.writing import ExportSpec
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import join_names, plural
 
-from ..clouds.frame_names import survey_start_ns
-from ..clouds.ros.layouts import MessageLayout
-from ..clouds.ros.messages import RosMessage, SurveyMessages
-from ..clouds.writing import ExportSpec
 from .bridge import Bridge, BridgeOptions
 from .dds import Network, RosPublisher
 from .schedule import Schedule

@@ -9,9 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import islice
 from typing import Generic, Self, TypeVar
 
+from lidarfiles.processes.processors import processor_count
 from lidarsim.numerics.arrays import Ints
-
-from ..processes.processors import processor_count
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1

@@ -15,6 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.folder import local_result
+from lidarfiles.clouds.navigation_files import write_instruments
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.picture_file import PICTURE_FILE, PictureContent
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import AXES, SCAN
@@ -25,11 +29,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarview.picture_file import PICTURE_FILE, PictureContent
 
-from ..clouds.folder import local_result
-from ..clouds.navigation_files import write_instruments
-from ..clouds.writing import ExportSpec
 from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_file import is_campaign

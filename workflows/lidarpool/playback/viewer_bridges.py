@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from lidarfiles.clouds.shown_sweeps import Surroundings, SweepSequence
+from lidarfiles.picture_file import PictureContent
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 
-from ..clouds.shown_sweeps import Surroundings, SweepSequence
 from ..viewers.viewer import Viewer, check_installed, open_viewer
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule

@@ -22,14 +22,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.rings import MIN_RINGS
+from lidarfiles.processes.processors import processor_count
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
-from ..clouds.rings import MIN_RINGS
-from ..processes.processors import processor_count
 from ..scan_patterns.lasers import RingLasers, unit_vectors
 from .blocked_directions import separated_sweeps
 from .lost_pulses import SensorCoverage, lost_pulses

@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from lidarfiles.clouds.folder import check_new_result, result_folder
+from lidarfiles.clouds.kitti import CALIBRATION_FILE
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.recordings.opening import as_recording
+from lidarfiles.work.mapping import MapFunction, parallel_map
+from lidarfiles.work.work import Inputs, Step, Work
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
@@ -24,14 +31,7 @@ from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.words import plural
 
-from ..clouds.folder import check_new_result, result_folder
-from ..clouds.kitti import CALIBRATION_FILE
-from ..clouds.recording import Recording
-from ..columns.parts import StoredCloud
 from ..comparing.lidar4d import WINDOWS
-from ..recordings.opening import as_recording
-from ..work.mapping import MapFunction, parallel_map
-from ..work.work import Inputs, Step, Work
 from .air_returns import AirStatistics
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .chart_data import STATIONARY_DOTS, SweepImages, TopViewPoints

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.rings import elevations
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
-from ..clouds.rings import elevations
 from .alignment import AlignedSweep, AlignedSweeps
 from .held_out import HeldOutRays
 

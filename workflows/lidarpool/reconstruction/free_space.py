@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarfiles.clouds.rings import elevations
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
-from ..clouds.rings import elevations
 from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweeps
 

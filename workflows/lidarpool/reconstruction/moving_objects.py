@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recorded_boxes import RecordedBoxes
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 
-from ..clouds.recorded_boxes import RecordedBoxes
 from .alignment import Alignment
 from .moving_rays import MovingRays
 from .object_clusters import MIN_PATH_M, MIN_SWEEPS, ClusterTrack, bounding_boxes, track_clusters

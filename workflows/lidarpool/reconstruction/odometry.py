@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.kitti import CALIBRATION_FILE, lidar_poses
 from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory_files import load_trajectory, read_kitti_poses
 from lidarsim.numerics.arrays import Floats
 from lidarsim.words import plural
 
-from ..clouds.kitti import CALIBRATION_FILE, lidar_poses
 from .recorded_sweeps import RecordedSweeps
 
 _VOXELS_OF_REACH = 75  # range of the sensor in voxels of the map

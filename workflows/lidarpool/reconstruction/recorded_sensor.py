@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim._version import __version__
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -17,7 +18,6 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.models import Performance, SensorModel
 from lidarsim.words import plural
 
-from ..clouds.recording import Recording
 from ..comparing.fit.fitting import Fit, fit
 from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweeps, Alignment

@@ -13,6 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.point_times import PointTimes
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
+from lidarfiles.recordings.opening import open_recording
 from lidarsim.columns.column_names import STRENGTHS, TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -20,11 +24,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
 
-from ..clouds.point_times import PointTimes
-from ..clouds.recording import Recording
-from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
 from ..comparing.lidar4d import WINDOWS, Window
-from ..recordings.opening import open_recording
 from ..scan_patterns.lasers import RingLasers
 from .isolated_returns import NO_RANGES, IsolatedRanges
 from .labels import labels_of

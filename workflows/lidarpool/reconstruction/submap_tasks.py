@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.work.mapping import describe_sweeps
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..work.mapping import describe_sweeps
 from .air_returns import AirStatistics, find_air_returns
 from .alignment import AlignedSweeps, Alignment, align
 from .chart_data import SweepImages, TopViewPoints

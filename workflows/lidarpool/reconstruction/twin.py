@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.work.publishing import publishing
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.errors import explain_os_errors
@@ -21,10 +23,8 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.models import SensorModel
 from lidarview.page_templates import render_template
 
-from ..clouds.folder import result_folder
 from ..comparing import lidar4d
 from ..scenario.point_scene import CLASS_MATERIAL
-from ..work.publishing import publishing
 from .labels import SurfelMaterial
 from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, class_names

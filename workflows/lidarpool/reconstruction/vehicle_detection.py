@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.clouds.rings import MIN_RINGS
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 
-from ..clouds.rings import MIN_RINGS
 from .alignment import transform_points
 from .free_space import RangeImage
 from .odometry import RecordedPoses, find_poses

@@ -1,7 +1,7 @@
 """Validate and write the data set of a campaign.
 
 This module validates the files of an existing data set and writes the files that all jobs share.
-The files of single jobs are written by `lidarpool.datasets`.
+The files of single jobs are written by `lidarfiles.datasets`.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from lidarfiles.clouds.folder import LAST_FILE, check_exists, result_folder
+from lidarfiles.clouds.format_table import DATA_SETS, load_format
+from lidarfiles.datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
+from lidarfiles.datasets.job_seconds import known_seconds
+from lidarfiles.datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
+from lidarfiles.datasets.loader import read_index, sweeps
+from lidarfiles.identity.field_words import describe_changes
+from lidarfiles.identity.sealed import seal_json, unseal_json
+from lidarfiles.identity.versions import software
 from lidarsim.errors import LidarError, explain_os_errors, message_of
 from lidarsim.io.storage import Storage
 from lidarsim.words import list_names, plural
 
-from ..clouds.folder import LAST_FILE, check_exists, result_folder
-from ..clouds.format_table import DATA_SETS, load_format
-from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
-from ..datasets.job_seconds import known_seconds
-from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
-from ..datasets.loader import read_index, sweeps
-from ..identity.field_words import describe_changes
 from ..identity.job_errors import summarize_errors
-from ..identity.sealed import seal_json, unseal_json
 from ..identity.shard import ALL, Shard, describe_shard
 from ..identity.software import describe_difference
-from ..identity.versions import software
 from ..run.cluster.cluster import ClusterConnection
 from ..run.committed import CommittedRun
 from ..run.listener import Listener

@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.folder import LAST_FILE
+from lidarfiles.clouds.format_table import data_set_title
+from lidarfiles.datasets.figures import DataSetStatistics
+from lidarfiles.datasets.job_seconds import writing_seconds
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarview.page_templates import render_template
 from lidarview.render.picture_page import Page
 
-from ..clouds.folder import LAST_FILE
-from ..clouds.format_table import data_set_title
-from ..datasets.figures import DataSetStatistics
-from ..datasets.job_seconds import writing_seconds
-from ..datasets.job_table import JobRow
 from ..run.run_result import CampaignRun
 from .charts import draw_results, draw_times, draw_varied
 from .page import rendering
@@ -68,7 +68,7 @@ def write_card(
     campaign, run
         The campaign in the form of `CampaignSpec.card_content`, and the totals of its run.
     jobs
-        Job rows in order, for example from `lidarpool.datasets.job_table.read_table`.
+        Job rows in order, for example from `lidarfiles.datasets.job_table.read_table`.
     versions
         {name: version} of the software that determines the bytes of the points.
     picture

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from lidarfiles.datasets.figures import DataSetStatistics, VariedQuantity
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, names_by_value
 from lidarsim.numerics.arrays import Bools, Floats, Indices
@@ -19,8 +20,6 @@ from lidarview.page_templates import NARROW
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
-
-from ..datasets.figures import DataSetStatistics, VariedQuantity
 
 WIDTH = 1600
 MAX_VARIED = 8  # quantities per picture

@@ -21,17 +21,17 @@ from threading import Thread
 
 import numpy as np
 
+from lidarfiles.clouds.ply import PlyAppender, position_dtype
+from lidarfiles.clouds.ply_rows import PlyRowEncoder
+from lidarfiles.parts.part_blocks import BlockMemory, read_blocks
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.processes.processors import processor_count
 from lidarsim.columns.table import AXES
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..clouds.ply import PlyAppender, position_dtype
-from ..clouds.ply_rows import PlyRowEncoder
-from ..columns.part_blocks import BlockMemory, read_blocks
-from ..columns.parts import StoredCloud
-from ..processes.processors import processor_count
 from ..run.pipeline.stage_messages import Receipt
 from ..run.store.stored_job import StoredJob
 from .cloud_counts import CloudCounts

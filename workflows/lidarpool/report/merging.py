@@ -11,21 +11,21 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from lidarfiles.clouds.folder import LAST_FILE, check_exists, output_destination, result_folder
+from lidarfiles.datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
+from lidarfiles.datasets.job_seconds import known_seconds, read_seconds
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.identity.field_words import describe_changes
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.identity.versions import software
+from lidarfiles.open3d_access.open3d_module import load_open3d
+from lidarfiles.parts.parts import part_name
 from lidarsim.errors import LidarError, MissingFileError, Mistakes, as_sentence, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_list, check_type
 from lidarsim.words import list_names
 
-from ..clouds.folder import LAST_FILE, check_exists, output_destination, result_folder
-from ..columns.parts import part_name
-from ..datasets.dataset import INDEX_FILE, DataSet, manifest_file, read_ahead
-from ..datasets.job_seconds import known_seconds, read_seconds
-from ..datasets.job_table import JobRow
-from ..identity.field_words import describe_changes
-from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
-from ..identity.versions import software
-from ..open3d_access.open3d_module import load_open3d
 from ..plan import Trial
 from ..run.committed import CommittedRun
 from ..run.job_source import SingleJob

@@ -14,19 +14,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.clouds.navigation_files import write_instruments
+from lidarfiles.clouds.writing import ExportSpec, check_foreign_files
+from lidarfiles.open3d_access.open3d_module import load_open3d
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.picture_file import PICTURE_FILE
+from lidarfiles.work.publishing import move_into_place
 from lidarsim.columns.table import optional_columns
 from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage, staging
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarview.picture_file import PICTURE_FILE
 
-from ..clouds.folder import result_folder
-from ..clouds.navigation_files import write_instruments
-from ..clouds.writing import ExportSpec, check_foreign_files
-from ..columns.parts import StoredCloud
-from ..open3d_access.open3d_module import load_open3d
 from ..processes import timeline
 from ..run.cluster.cluster import Cluster, ClusterConnection
 from ..run.job_source import SingleJob
@@ -39,7 +40,6 @@ from ..run.runner import cast, open_store
 from ..run.store.run_store import RunStore
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
-from ..work.publishing import move_into_place
 from .cloud_counts import CloudCounts
 from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture
+from lidarfiles.picture_file import PictureContent, PlannedPath, PlanningPicture
 
 from ..plan import Plan, Planning, Trial
 from ..run.run_result import RunResult

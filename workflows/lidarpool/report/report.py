@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.flight_lines import summarize_flight_lines
 from lidarsim._version import __version__
 from lidarsim.columns.table import NO_SURFACE
 from lidarsim.io.storage import Storage
@@ -22,7 +23,6 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
-from ..clouds.flight_lines import summarize_flight_lines
 from ..plan.flight_density import DensityMap, cell_side_m, longest_side_m, summarize_density
 from ..plan.planning import Search
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT

@@ -11,18 +11,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from lidarfiles.clouds.folder import LAST_FILE
+from lidarfiles.clouds.format_table import FORMATS, format_row, plugin_formats
+from lidarfiles.clouds.writing import ExportSpec, check_foreign_files
+from lidarfiles.identity.field_words import describe_changes
+from lidarfiles.picture_file import PICTURE_FILE
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.schema.vocabulary import PICTURES
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
-from lidarview.picture_file import PICTURE_FILE
-
-from ..clouds.folder import LAST_FILE
-from ..clouds.format_table import FORMATS, format_row, plugin_formats
-from ..clouds.writing import ExportSpec, check_foreign_files
-from ..identity.field_words import describe_changes
 
 if TYPE_CHECKING:
     from ..run.job_source import SingleJob

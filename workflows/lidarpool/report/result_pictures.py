@@ -17,6 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from lidarfiles.clouds.folder import result_folder
+from lidarfiles.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
+from lidarfiles.work.publishing import move_into_place
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
@@ -27,7 +30,6 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.vocabulary import PICTURES
 from lidarsim.words import did_you_mean, join_alternatives, plural
-from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.coloring import add_composed_columns
 from lidarview.render.picture_page import DPI, FONT, LEFT_LABEL, RIGHT_LABEL, Page
@@ -35,9 +37,7 @@ from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_sc
 from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
-from ..clouds.folder import result_folder
 from ..plan.stations import StationPlan, StationVisibility
-from ..work.publishing import move_into_place
 from .page.rendering import insert_picture
 from .result_files import PAGE
 

@@ -14,6 +14,8 @@ import numpy as np
 from dask.system import CPU_COUNT
 from distributed.system import MEMORY_LIMIT
 
+from lidarfiles.clouds.flight_lines import firing_span_s, flight_lines, summarize_flight_lines
+from lidarfiles.clouds.navigation_files import instrument_bytes
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.casting.visibility import unseen_objects
 from lidarsim.columns.cloud import CHUNK_POINTS
@@ -37,8 +39,6 @@ from lidarsim.words import join_names
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..clouds.flight_lines import firing_span_s, flight_lines, summarize_flight_lines
-from ..clouds.navigation_files import instrument_bytes
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from ..scenario.job import Job
 from .cluster.requirements import check_memory, default_workers, slots_needed

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from lidarfiles.datasets.job_table import JobRow, Value
+from lidarfiles.identity.field_words import describe_fields
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
@@ -20,9 +23,6 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
-from ..datasets.job_table import JobRow, Value
-from ..identity.field_words import describe_fields
-from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
 from ..plan import Planning
 from ..scenario.job import Job

@@ -16,11 +16,11 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.words import list_names, plural
 
-from ..datasets.job_table import JobRow
 from ..plan import Planning, Trial
 from ..processes import timeline
 from ..scenario.job import Job
@@ -43,7 +43,7 @@ from .store.stored_job import StoredJob
 from .writer import DataSetWriter, WriteRequest
 
 if TYPE_CHECKING:
-    from ..datasets.dataset import DataSet
+    from lidarfiles.datasets.dataset import DataSet
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # interval at which the number of delivered frames is stored

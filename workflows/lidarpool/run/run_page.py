@@ -6,16 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarfiles.datasets.job_table import JobRow
 from poolpart import Partition
 
-from ..datasets.job_table import JobRow
 from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Progress
 from .run_result import RunResult
 from .store.stored_job import StoredJob
 
 if TYPE_CHECKING:
-    from ..datasets.dataset import DataSet
+    from lidarfiles.datasets.dataset import DataSet
 
 
 class RunPage:

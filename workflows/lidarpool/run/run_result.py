@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.parts.parts import StoredCloud
 from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 
-from ..columns.parts import StoredCloud
-from ..datasets.job_table import JobRow
 from ..plan import Plan, Planning, Trial
 from .job_source import describe_inputs
 from .pipeline.task_book import StageTotals

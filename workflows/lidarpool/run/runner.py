@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-from ..datasets.job_table import JobRow
+from lidarfiles.datasets.job_table import JobRow
+
 from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
 from .committed import CommittedRun
@@ -25,7 +26,7 @@ from .run_result import RunResult
 from .store.run_store import RunStore, remove_run
 
 if TYPE_CHECKING:
-    from ..datasets.dataset import DataSet
+    from lidarfiles.datasets.dataset import DataSet
 
 
 def cast_to_store(

@@ -20,6 +20,10 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
+from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.kitti import kitti_intensity
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.datasets.sweep_data import sweep_of_job
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -32,10 +36,6 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
-from ..clouds.boxes import Boxes
-from ..clouds.kitti import kitti_intensity
-from ..datasets.job_table import JobRow
-from ..datasets.sweep_data import sweep_of_job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import DatasetFormat
 from ..scenario.empty_cloud import empty_cloud_reason
@@ -119,7 +119,7 @@ class SweepStream:
         """
         if find_spec("torch") is None:
             raise LidarError(f"`torch` requires PyTorch. Run {install_command('torch')}.")
-        from ..datasets.torch_sweeps import TorchStream
+        from lidarfiles.datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)
 

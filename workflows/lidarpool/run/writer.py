@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from distributed import Reschedule
 
+from lidarfiles.clouds.multi_file_format import PieceRange, RangeWriter
+from lidarfiles.clouds.multi_file_format import WrittenRange as Range
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.identity.versions import plugin_versions
+from lidarfiles.parts.parts import StoredCloud
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, Storage
 from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
-from ..clouds.multi_file_format import PieceRange, RangeWriter
-from ..clouds.multi_file_format import WrittenRange as Range
-from ..columns.parts import StoredCloud
-from ..datasets.job_table import JobRow
-from ..identity.versions import plugin_versions
 from .cluster.cluster import Cluster
 from .cluster.tasks import TaskGroup
 from .pipeline.casting_workers import submit_value
@@ -34,7 +34,7 @@ from .run_result import RunResult
 from .store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from ..datasets.dataset import DataSet
+    from lidarfiles.datasets.dataset import DataSet
 
 TASKS_PER_SLOT = 2  # submitted tasks per free slot of LIDAR
 MAX_JOBS_PER_TASK = 32
@@ -91,7 +91,9 @@ def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
 
     If this fails, return a LidarError for a storage error, or a JobError for any other error.
     """
-    from ..datasets.dataset import Listing  # imported late, because surveys write no data set
+    from lidarfiles.datasets.dataset import (
+        Listing,  # imported late, because surveys write no data set
+    )
 
     listing = Listing.from_storage(dataset.storage)
     try:

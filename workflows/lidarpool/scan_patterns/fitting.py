@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.recordings.opening import as_recording
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
@@ -21,9 +24,6 @@ from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.sensor_files.format_table import format_of
 from lidarsim.words import plural
 
-from ..clouds.recording import Recording
-from ..columns.parts import StoredCloud
-from ..recordings.opening import as_recording
 from .listed_rays import ListedRays
 from .pattern_returns import PatternReturns
 from .spinning_head import SpinningHead

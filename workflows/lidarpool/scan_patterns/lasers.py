@@ -19,10 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.rings import MIN_RINGS, elevations
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
-
-from ..clouds.rings import MIN_RINGS, elevations
 
 _MIN_RETURNS = 50  # minimum number of returns of a ring in a sweep
 _MIN_RANGE_M = 0.5  # The lasers are closer to the origin than the returns that are used.

@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.rings import elevations
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.words import plural
-
-from ..clouds.recording import Recording
-from ..clouds.rings import elevations
 
 _MAX_RETURNS = 6_000_000  # maximum number of returns in memory
 _MIN_RETURNS = 1_000  # minimum number of returns from which a pattern is determined

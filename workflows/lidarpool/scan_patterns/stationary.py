@@ -6,12 +6,12 @@ from contextlib import suppress
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import format_rounded
 
-from ..clouds.recording import Recording
 from ..comparing.fit.known_poses import KnownPoses
 from ..comparing.fit.stack import SweepStack
 from ..comparing.fit.standstill import Speed, find_motion, sweep_period_ns

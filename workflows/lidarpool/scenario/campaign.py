@@ -15,16 +15,16 @@ from typing import Any, Self
 
 import numpy as np
 
+from lidarfiles.clouds.writing import with_format_columns
+from lidarfiles.datasets.job_table import Value
+from lidarfiles.identity.field_words import describe_fields
+from lidarfiles.identity.fingerprint import fingerprint
 from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.input_files import not_found, read_input_text
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.checks import check_list, check_number
 from lidarsim.schema.error_sentences import convert_validation_errors
 
-from ..clouds.writing import with_format_columns
-from ..datasets.job_table import Value
-from ..identity.field_words import describe_fields
-from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
 from .campaign_jobs import FunctionJobs, JobSource, SampledJobs, ScenarioJobs
 from .campaign_sections import MAX_JOBS, CampaignSection, DatasetFormat, Splits

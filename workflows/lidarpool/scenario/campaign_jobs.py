@@ -21,6 +21,11 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
+from lidarfiles.clouds.format_table import check_all_returns
+from lidarfiles.datasets.job_table import Value
+from lidarfiles.identity.field_words import describe_fields
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.identity.versions import plugin_versions
 from lidarsim.errors import LidarError, Mistakes, prefix_errors
 from lidarsim.io.input_files import open_input
 from lidarsim.io.textfile import read_text
@@ -29,11 +34,6 @@ from lidarsim.schema.section_fields import format_path
 from lidarsim.schema.value_texts import format_value
 from lidarsim.words import plural
 
-from ..clouds.format_table import check_all_returns
-from ..datasets.job_table import Value
-from ..identity.field_words import describe_fields
-from ..identity.fingerprint import fingerprint
-from ..identity.versions import plugin_versions
 from .campaign_file import is_campaign
 from .campaign_sections import (
     MAX_JOBS,

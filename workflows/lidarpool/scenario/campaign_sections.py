@@ -29,6 +29,9 @@ from pydantic import (
     model_validator,
 )
 
+from lidarfiles.clouds.format_table import DATA_SETS, LAYOUTS
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.job_table import Value
 from lidarsim.errors import LidarError, MissingFileError, Mistakes, message_of
 from lidarsim.io.input_files import not_found
 from lidarsim.io.tables import ignored_columns
@@ -55,9 +58,6 @@ from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
 from lidarsim.words import did_you_mean_each, format_yaml_list, join_names, printable
 
-from ..clouds.format_table import DATA_SETS, LAYOUTS
-from ..clouds.writing import ExportSpec
-from ..datasets.job_table import Value
 from .sections import IgnoredColumns, Section, allow_empty
 
 # Normally distributed numbers are limited to this many standard deviations from the mean. Numbers

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from lidarfiles.datasets.job_table import JobRow
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
 from lidarsim.words import format_rounded, join_names, plural
 
-from ..datasets.job_table import JobRow
 from .default_poses import outside_view_hint
 
 EMPTY = "the cloud has no points"

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarsim.casting.static_bodies import warn_of_reach
 from lidarsim.casting.surfaces import warn_of_gray
 from lidarsim.casting.visibility import unseen_objects
@@ -23,7 +24,6 @@ from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..clouds.writing import ExportSpec
 from ..plan import Planning
 from .georeference import check_epsg, location_warning
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.format_table import format_of_path, point_suffixes
+from lidarfiles.clouds.recording import METERS, Recording, RecordingSource
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.environment.extras import reading
@@ -23,9 +25,6 @@ from lidarsim.scene.files.pcd import split_rgb
 from lidarsim.scene.files.stated_system import Reprojection, check_metric_format, stated_meters
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 from lidarsim.words import plural, printable
-
-from ..clouds.format_table import format_of_path, point_suffixes
-from ..clouds.recording import METERS, Recording, RecordingSource
 
 MIN_POINTS = 12  # number of points to which each surfel is fitted
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written

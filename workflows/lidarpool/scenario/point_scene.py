@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -29,7 +30,6 @@ from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import format_rounded, plural
 
-from ..open3d_access.open3d_module import load_open3d
 from .point_files import MIN_POINTS, NO_CLASS, POINT_BYTES, read_points, vectors
 from .surfel_gaps import expected_loss
 

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.format_table import check_all_returns
+from lidarfiles.clouds.writing import with_format_columns
 from lidarscenes.robots.robot import Robot
 from lidarsim.errors import LidarError, Mistakes, prefix_errors
 from lidarsim.media.materials import (
@@ -36,8 +38,6 @@ from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.words import name_hint, plural
 
-from ..clouds.format_table import check_all_returns
-from ..clouds.writing import with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection

@@ -19,6 +19,7 @@ from pydantic import (
     model_validator,
 )
 
+from lidarfiles.clouds.writing import ExportSpec
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import SemanticClass
 from lidarsim.motion.trajectory import Pose
@@ -59,7 +60,6 @@ from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 from lidarsim.survey.survey import EpsgCode, Mounted
 
-from ..clouds.writing import ExportSpec
 from ..plan.planning import Search
 
 MAX_COPIES = 1_000_000  # maximum number of copies of an entry

@@ -11,11 +11,11 @@ import numpy as np
 from foxglove import channels, messages
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
+from lidarfiles.clouds.frame_names import WORLD
+from lidarfiles.clouds.shown_sweeps import ActorBoxes, FramePose, ShownSweep, Surface, Surroundings
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Floats32, Records
 
-from ..clouds.frame_names import WORLD
-from ..clouds.shown_sweeps import ActorBoxes, FramePose, ShownSweep, Surface, Surroundings
 from .viewer import LOOPBACK, Address, Viewer
 
 PORT = 8765  # default port of Foxglove

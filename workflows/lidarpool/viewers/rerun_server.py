@@ -7,11 +7,11 @@ import sys
 
 import rerun as rr
 
+from lidarfiles.clouds.rrd import APPLICATION, RerunLog
+from lidarfiles.clouds.shown_sweeps import ShownSweep, Surroundings
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats
 
-from ..clouds.rrd import APPLICATION, RerunLog
-from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from . import attached_child
 from .viewer import Address, Viewer
 

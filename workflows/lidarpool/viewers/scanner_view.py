@@ -10,6 +10,15 @@ from typing import Any, Self
 import click
 import numpy as np
 
+from lidarfiles.clouds.frame_names import VEHICLE, WORLD, frame_names, points_topic
+from lidarfiles.clouds.shown_sweeps import (
+    ActorBoxes,
+    FramePose,
+    ShownSweep,
+    Surface,
+    Surroundings,
+    viewer_columns,
+)
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import quaternions_of
@@ -20,15 +29,6 @@ from lidarsim.schema.checks import check_type
 from lidarsim.simulator import Scanner
 from lidarsim.sweeps.sweeps import actor_type
 
-from ..clouds.frame_names import VEHICLE, WORLD, frame_names, points_topic
-from ..clouds.shown_sweeps import (
-    ActorBoxes,
-    FramePose,
-    ShownSweep,
-    Surface,
-    Surroundings,
-    viewer_columns,
-)
 from .viewer import Viewer, open_viewer
 
 

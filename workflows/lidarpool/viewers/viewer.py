@@ -13,6 +13,7 @@ from ipaddress import ip_address
 from types import NoneType, TracebackType
 from typing import Any, NamedTuple, Self
 
+from lidarfiles.clouds.shown_sweeps import ShownSweep, Surroundings
 from lidarsim.environment.extras import install_command
 from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
@@ -20,7 +21,6 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.schema.checks import check_type
 from lidarsim.words import shorten_name
 
-from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from .viewer_table import VIEWERS
 
 LOOPBACK = "127.0.0.1"

@@ -37,7 +37,7 @@ ALIASES: Mapping[str, tuple[str, ...]] = {
     "rgba": (),
 }
 # Names of point times, in order of preference. They have no standard name, because their unit and
-# clock depend on the values (`lidarpool/clouds/point_times.py`).
+# clock depend on the values (`lidarfiles/clouds/point_times.py`).
 TIMES = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset", "time_stamp")
 # Columns that contain the strength of a return, in order of preference.
 STRENGTHS = ("intensity", "reflectivity")

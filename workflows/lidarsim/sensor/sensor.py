@@ -63,7 +63,7 @@ class Sensor:
 
     To define another kind of sensor, use other beams or another head, or write a subclass that
     overrides `directions`, `origins` or `begins_ns`. No other code has to be changed. A sensor is
-    identified by its fields (see `lidarpool.identity.fingerprint`), so any data that affects the
+    identified by its fields (see `lidarfiles.identity.fingerprint`), so any data that affects the
     rays must be stored in fields.
 
     Parameters

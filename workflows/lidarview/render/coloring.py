@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.color_table import TURBO
 from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.colors import pack_colors, unpack_colors
 
-from ..color_table import TURBO
 from .theme import apply_colormap, object_colors
 
 DIVERGING = apply_colormap("coolwarm", np.linspace(0, 1, 256))  # (256, 3), pale at the center

@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 
+from lidarfiles.color_table import TURBO
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 
-from ..color_table import TURBO
 from .theme import UNSEEN, rgb
 
 _GRID_LEVELS = 24  # number of times that the width of the grid cells is halved

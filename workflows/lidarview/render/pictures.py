@@ -8,6 +8,7 @@ from textwrap import fill
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
+from lidarfiles.color_table import TURBO
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, Column, Z
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
@@ -15,7 +16,6 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.words import plural, remove_common_prefix
 
-from ..color_table import TURBO
 from . import theme
 from .coloring import column_values, make_coloring
 from .hit_density import hit_colors, hits_title

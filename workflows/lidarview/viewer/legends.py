@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.color_table import TURBO
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import as_bytes
 from lidarsim.words import format_rounded
 
-from ..color_table import TURBO
 from ..render.coloring import NORMALS, RGB, Coloring
 
 MAX_LABELS = 1000  # maximum number of labels in a legend

@@ -10,13 +10,13 @@ from threading import Event
 import click
 import numpy as np
 
+from lidarfiles.picture_file import PICTURE_FILE, PictureContent
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.environment.notebook import cell_display
 from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarsim.words import plural
 
-from ..picture_file import PICTURE_FILE, PictureContent
 from .point_selection import JoinedPoints
 from .server import PORT, PageServer, announce_page, page_server
 from .view import CLOUD, IN_SENSOR_AXES, DownloadFormats, ProgressiveView, View

@@ -23,6 +23,8 @@ import click
 import numpy as np
 from PIL import Image
 
+from lidarfiles.color_table import TURBO
+from lidarfiles.picture_file import SensorPositions
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import replace_file
 from lidarsim.io.writing_progress import WritingProgress
@@ -30,8 +32,6 @@ from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..color_table import TURBO
-from ..picture_file import SensorPositions
 from ..render.film import Film
 from .legends import make_legend
 from .packing import pack_column, pack_positions

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.picture_file import MAX_POSITIONS, PictureContent, SensorPositions, moving_positions
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
@@ -37,7 +38,6 @@ from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 from raybeam import RayCaster
 
-from ..picture_file import MAX_POSITIONS, PictureContent, SensorPositions, moving_positions
 from ..render.closeup import floor_and_cut_heights, surrounding_box
 from ..render.coloring import (
     MAX_UNNAMED_LABELS,

@@ -17,6 +17,9 @@ from zlib import crc32
 import numpy as np
 import yaml
 
+from lidarfiles.clouds.recording import Recording, RecordingSource, sweep_from_columns
+from lidarfiles.clouds.ros.bags import header_of, point_connection
+from lidarfiles.processes.per_process import PerProcess
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -32,9 +35,6 @@ from lidarsim.io.input_files import read_input_text
 from lidarsim.io.storage import Storage
 from lidarsim.words import plural
 
-from ...clouds.recording import Recording, RecordingSource, sweep_from_columns
-from ...clouds.ros.bags import header_of, point_connection
-from ...processes.per_process import PerProcess
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set
 from .mcap_copy import AddedTopic, NewContent, copy_mcap
@@ -70,7 +70,7 @@ class BagRewriter(Rewriter):
         self, number: int, augmented: AugmentedSweep
     ) -> tuple[dict[str, bytes], dict[str, Any]]:
         """Return the message of a sweep, and a message with the boxes of inserted objects."""
-        from ...clouds.ros.messages import box_markers
+        from lidarfiles.clouds.ros.messages import box_markers
 
         kind, time_ns, data = self._messages().read(number)
         details: dict[str, Any] = {"boxes": len(augmented.boxes)}
@@ -422,19 +422,19 @@ def _type_hash(connection: Any) -> str:
 
 
 def _add_box_topic(topic: str, target: Any) -> Any:
-    from ...clouds.ros.messages import message_store
+    from lidarfiles.clouds.ros.messages import message_store
 
     return target.add_connection(topic, _MARKERS, typestore=message_store())
 
 
 def _marker_definition() -> str:
-    from ...clouds.ros.messages import message_store
+    from lidarfiles.clouds.ros.messages import message_store
 
     definition, _ = message_store().generate_msgdef(_MARKERS, ros_version=2)
     return str(definition)
 
 
 def _marker_hash() -> str:
-    from ...clouds.ros.messages import message_store
+    from lidarfiles.clouds.ros.messages import message_store
 
     return str(message_store().hash_rihs01(_MARKERS))

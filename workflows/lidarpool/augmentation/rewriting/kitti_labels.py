@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.boxes import SweepBoxes
+from lidarfiles.clouds.kitti_boxes import LEVEL_CAMERA, read_calibration
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import Floats
 
-from ...clouds.boxes import SweepBoxes
-from ...clouds.kitti_boxes import LEVEL_CAMERA, read_calibration
 from ..augmented_sweep import AugmentedSweep
 from ..object_classes import find_class
 

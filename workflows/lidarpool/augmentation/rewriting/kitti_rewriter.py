@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.kitti import CALIBRATION_FILE, MAX_INSTANCES, point_files, sequence_folders
+from lidarfiles.clouds.recording import Recording, RecordingSource
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input, read_input_text
 from lidarsim.numerics.arrays import Ints
 from lidarsim.scene.files.float_rows import columns_by_name
 from lidarsim.words import list_names, plural
 
-from ...clouds.kitti import CALIBRATION_FILE, MAX_INSTANCES, point_files, sequence_folders
-from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set, place_file
 from .kitti_labels import KittiCamera, Label

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.nuscenes import NuScenesTables, tables_folder
+from lidarfiles.clouds.recording import Recording, RecordingSource
 from lidarsim.errors import LidarError
 from lidarsim.io.archives import pack_arrays
 from lidarsim.io.input_files import read_input
@@ -20,8 +22,6 @@ from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES
 from lidarsim.words import join_names, plural
 
-from ...clouds.nuscenes import NuScenesTables, tables_folder
-from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set, place_file
 from .nuscenes_categories import (

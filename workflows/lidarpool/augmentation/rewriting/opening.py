@@ -5,16 +5,16 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
+from lidarfiles.clouds.format_table import format_of_path
+from lidarfiles.clouds.kitti import KITTI
+from lidarfiles.clouds.nuscenes import NuScenes
+from lidarfiles.clouds.pcd import PCD
+from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.ros.bags import Rosbag2
+from lidarfiles.datasets.dataset import INDEX_FILE
 from lidarsim.errors import LidarError
 from lidarsim.words import join_alternatives
 
-from ...clouds.format_table import format_of_path
-from ...clouds.kitti import KITTI
-from ...clouds.nuscenes import NuScenes
-from ...clouds.pcd import PCD
-from ...clouds.recording import Recording, RecordingSource
-from ...clouds.ros.bags import Rosbag2
-from ...datasets.dataset import INDEX_FILE
 from .bag_rewriter import BagRewriter
 from .kitti_rewriter import KittiRewriter
 from .nuscenes_rewriter import NuScenesRewriter

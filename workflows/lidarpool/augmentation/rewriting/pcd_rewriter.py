@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.pcd import point_files
+from lidarfiles.clouds.recording import Recording, RecordingSource
 from lidarsim.io.input_files import read_input
 from lidarsim.scene.files.pcd import PCDRecords
 
-from ...clouds.pcd import point_files
-from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set, place_file
 from .rewriter import EncodedSweeps, Rewriter, organization_notes

@@ -16,11 +16,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording, RecordingSource
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.words import list_names, plural
 
-from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import MARK_FILE, check_target
 from .stored_records import StoredRecords

@@ -13,6 +13,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.recordings.opening import as_recording
+from lidarfiles.work.publishing import publishing
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
@@ -23,10 +27,6 @@ from lidarsim.sensor.models import MODEL_FILES, Performance, SensorModel, read_m
 from lidarsim.words import plural
 from lidarview.page_templates import render_template
 
-from ...clouds.recording import Recording
-from ...columns.parts import StoredCloud
-from ...recordings.opening import as_recording
-from ...work.publishing import publishing
 from .estimates import Estimate
 from .known_poses import KnownPoses
 from .measured import SensorMeasurement, measure_moving, measure_standing

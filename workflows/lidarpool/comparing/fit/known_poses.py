@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import check_rotations
@@ -20,7 +21,6 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweep_motion import FiringPoses
 from lidarsim.words import plural
 
-from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, with_compared_columns
 from .standstill import Speed, sweep_period_ns
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.scene import Scene
@@ -14,7 +15,6 @@ from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
 
-from ...clouds.recording import Recording
 from .estimates import MIN_RAYS, Estimate
 from .known_poses import KnownPoses
 from .moving_pulses import ScenePulses, measure_pulses

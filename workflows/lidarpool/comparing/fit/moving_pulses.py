@@ -12,6 +12,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import NORMAL
 from lidarsim.motion.rotations import matrices
@@ -23,7 +24,6 @@ from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
 
-from ...clouds.recording import Recording
 from .smooth_surfaces import (
     ASSUMED_DIRECTION_NOISE_RAD,
     MAX_KINK_PER_M,

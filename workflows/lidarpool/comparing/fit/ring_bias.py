@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 from lidarsim.numerics.even_samples import even_indices
 
-from ...open3d_access.open3d_module import load_open3d
 from .estimates import Estimate, sandwich
 from .smooth_surfaces import SmoothRays
 

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import format_rounded
 
-from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, rings_note
 from ..range_image import RangeImages, range_images
 

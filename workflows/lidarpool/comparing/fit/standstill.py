@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import format_rounded
 
-from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
 from .search import MIN_SHIFT_M, MIN_YAW_RAD, motion_between
 from .stack import SweepStack, finite_median

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.io.writing_progress import WritingProgress
@@ -15,7 +16,6 @@ from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.scene.files.meshfile import Objects, load_objects
 from lidarsim.scene.scene_instances import SceneInstance
 
-from ...open3d_access.open3d_module import load_open3d
 from ..compared_sweep import bounds_of, origin_to_add
 from ..stated_frames import StatedFrame, check_same_systems
 from .deviations import Deviations, normal_columns

@@ -12,10 +12,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from lidarfiles.open3d_access.neighbors import NeighborSearch, nearest_neighbors
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 from lidarsim.numerics.random_numbers import hash_rows
 
-from ...open3d_access.neighbors import NeighborSearch, nearest_neighbors
 from .survey_clouds import SurveyPoints
 
 _NEIGHBORS = 8  # neighbors to which a point may be linked

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.open3d_access.neighbors import NeighborSearch
 from lidarsim.errors import LidarError
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
 
-from ...open3d_access.neighbors import NeighborSearch
 from .deviations import Deviations, normal_columns
 from .orientation import OrientedPoints, nearby_scanners, thin_out
 from .survey_clouds import SurveyPoints

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.motion.straight_lines import StraightLines
 from lidarsim.numerics.arrays import Bools, Floats, Indices, Ints
 from lidarsim.words import distinct_names, plural
 
-from ...clouds.recording import Recording
 from .deviations import Deviations, statistics
 from .survey_clouds import SENSOR, SurveyCloud
 

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.clouds.recording import Recording, SeveralSensorsError
+from lidarfiles.parts.parts import StoredCloud
+from lidarfiles.recordings.opening import open_recording
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -17,9 +20,6 @@ from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.vocabulary import UNITS_M
 
-from ...clouds.recording import Recording, SeveralSensorsError
-from ...columns.parts import StoredCloud
-from ...recordings.opening import open_recording
 from ..compared_sweep import bounds_of, check_reach, origin_to_add, separation_m
 from ..stated_frames import StatedFrame, check_same_systems
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.clouds.writing import save_cloud
 from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Floats
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.page_templates import render_template
 
-from ...clouds.writing import save_cloud
 from ..comparison_files import write_comparison
 from .deviations import STATISTICS
 

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 from distributed import Client
 
+from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.identity.versions import software
 from lidarsim._version import __version__
 from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError
@@ -20,9 +22,7 @@ from poolpart.task_locations import take_snapshot
 from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
-from ...clouds.writing import ExportSpec
 from ...identity.software import describe_difference, software_query
-from ...identity.versions import software
 from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT

@@ -14,9 +14,9 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 
+from lidarfiles.parts.parts import part_name
 from poolpart.task_locations import PartitionSnapshot
 
-from ...columns.parts import part_name
 from . import policies
 from .batches import Batch, BatchState, Outcome
 from .casting_workers import CastingWorkers

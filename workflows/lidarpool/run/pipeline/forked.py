@@ -18,10 +18,10 @@ import numpy.ma  # noqa: F401 - numba imports it with the first array
 import tornado.platform.asyncio  # noqa: F401
 
 import poolpart.deploy.local  # noqa: F401
+from lidarfiles.identity import versions
+from lidarfiles.processes.freed_memory import keep_freed_memory
 
-from ...identity import versions
 from ...plan import trial  # noqa: F401
-from ...processes.freed_memory import keep_freed_memory
 from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()

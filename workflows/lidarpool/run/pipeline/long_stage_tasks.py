@@ -17,6 +17,7 @@ from itertools import chain
 
 from distributed import Client, secede
 
+from lidarfiles.parts.parts import pack
 from lidarsim.io.storage import Storage
 from lidarsim.survey.survey import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
@@ -24,7 +25,6 @@ from poolpart.fetch import fetch_available, hold_bytes
 from poolpart.pipe import get_advice
 from poolpart.task_context import translate_leaving_errors
 
-from ...columns.parts import pack
 from .failures import ScanError, convert_storage_errors, naming_scans
 from .rigs import CastBatch
 from .stage_messages import (

@@ -25,6 +25,7 @@ from typing import Any
 
 from distributed import Future, Lock
 
+from lidarfiles.parts.parts import probe_name
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.words import plural
@@ -33,7 +34,6 @@ from poolpart.fetch import fetch_available, fetch_held_bytes
 from poolpart.pipe import delete_pipes, exchange_items, set_advice
 from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
-from ...columns.parts import probe_name
 from ...identity.software import call_with_same_sources
 from .failures import convert_storage_errors, memory_clause, raise_if_failed, was_killed
 from .long_stage_tasks import collect, generate, sort_frames

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from lidarfiles.datasets.job_table import MAX_JOBS
+from lidarfiles.parts.parts import part_name
 from lidarsim.errors import LidarError
 
-from ...columns.parts import part_name
-from ...datasets.job_table import MAX_JOBS
 from ...plan import Trial
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.stage_messages import Receipt

@@ -14,18 +14,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lidarfiles.datasets.job_table import JobRow
+from lidarfiles.identity.field_words import describe_changes
+from lidarfiles.identity.fingerprint import fingerprint
+from lidarfiles.identity.versions import software
+from lidarfiles.parts.parts import deletable_files, mark_name, parse_part_name
 from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.words import format_rounded
 
-from ...columns.parts import deletable_files, mark_name, parse_part_name
-from ...datasets.job_table import JobRow
-from ...identity.field_words import describe_changes
-from ...identity.fingerprint import fingerprint
 from ...identity.shard import ALL, describe_shard
-from ...identity.versions import software
 from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults

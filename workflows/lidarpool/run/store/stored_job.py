@@ -9,13 +9,13 @@ from functools import partial
 
 import numpy as np
 
+from lidarfiles.parts.parts import StoredCloud, read_actor_rays, read_hit_counts, read_part, unpack
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...columns.parts import StoredCloud, read_actor_rays, read_hit_counts, read_part, unpack
 from ...plan import Trial
 from ...scenario.job import Job
 from ..pipeline.committed_results import CommittedParts, CommittedResults

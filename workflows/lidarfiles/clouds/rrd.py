@@ -16,8 +16,8 @@ import numpy as np
 from lidarsim.columns.table import COLORS
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Floats32
 from lidarsim.packets.encoders import START_NS
-from lidarview.color_table import TURBO
 
+from ..color_table import TURBO
 from .cloud_format import CloudFormat
 from .frame_names import VEHICLE, WORLD
 from .point_field import OMITTED, PointField

@@ -25,9 +25,9 @@ from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarsim.words import join_alternatives, join_names
-from lidarview.picture_file import PictureContent
 
-from ..columns.parts import StoredCloud
+from ..parts.parts import StoredCloud
+from ..picture_file import PictureContent
 from ..work.publishing import publishing
 from .cloud_format import CloudFormat
 from .format_row import FormatRow

@@ -15,8 +15,8 @@ from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyArray, Floats32
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 
+from ..picture_file import PictureContent
 from .format_row import FormatRow
 from .point_field import PointField
 from .recording import Recording, RecordingSource

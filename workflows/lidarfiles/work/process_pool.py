@@ -29,7 +29,7 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NU
 # The main script of this process is not imported, because it may not have a main guard.
 _SCRIPT = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from lidarpool.work.serving_process import serve; serve(int(sys.argv[2]))"
+    "from lidarfiles.work.serving_process import serve; serve(int(sys.argv[2]))"
 )
 
 

@@ -26,55 +26,55 @@ _LAS: dict[str, Any] = {"packages": ("laspy", "lazrs"), "extra": "las"}
 _OSI: dict[str, Any] = {"packages": ("betterosi",), "extra": "osi"}
 _ROS: dict[str, Any] = {"packages": ("rosbags",), "extra": "ros"}
 FORMATS = {
-    "ply": FormatRow("cloud.ply", "lidarpool.clouds.ply:PLY", (".ply",), ("cloud.ply",)),
-    "las": FormatRow("cloud.las", "lidarpool.clouds.las:LAS", (".las",), **_LAS),
-    "laz": FormatRow("cloud.laz", "lidarpool.clouds.las:LAZ", (".laz",), **_LAS),
+    "ply": FormatRow("cloud.ply", "lidarfiles.clouds.ply:PLY", (".ply",), ("cloud.ply",)),
+    "las": FormatRow("cloud.las", "lidarfiles.clouds.las:LAS", (".las",), **_LAS),
+    "laz": FormatRow("cloud.laz", "lidarfiles.clouds.las:LAZ", (".laz",), **_LAS),
     "parquet": FormatRow(
         "cloud.parquet",
-        "lidarpool.clouds.parquet:Parquet",
+        "lidarfiles.clouds.parquet:Parquet",
         (".parquet",),
         ("**/*.parquet",),
         packages=("pyarrow",),
         extra="parquet",
     ),
-    "pcd": FormatRow("pcd", "lidarpool.clouds.pcd:PCD", (".pcd",), ("*.[pP][cC][dD]",)),
+    "pcd": FormatRow("pcd", "lidarfiles.clouds.pcd:PCD", (".pcd",), ("*.[pP][cC][dD]",)),
     "e57": FormatRow(
         "cloud.e57",
-        "lidarpool.clouds.e57:E57",
+        "lidarfiles.clouds.e57:E57",
         (".e57",),
         packages=("pye57",),
         extra="e57",
     ),
     "kitti": FormatRow(
         "kitti",
-        "lidarpool.clouds.kitti:KITTI",
+        "lidarfiles.clouds.kitti:KITTI",
         (".bin",),
         ("sequences/*/velodyne", "velodyne/*.bin", "velodyne_points/data/*.bin", "*.bin"),
     ),
     "nuscenes": FormatRow(
         "nuscenes",
-        "lidarpool.clouds.nuscenes:NuScenes",
+        "lidarfiles.clouds.nuscenes:NuScenes",
         folders=("v1.0-*/sample_data.json", "sample_data.json"),
     ),
     "webdataset": FormatRow(
-        "webdataset", "lidarpool.clouds.webdataset:WebDataset", (".tar",), ("**/*.tar",)
+        "webdataset", "lidarfiles.clouds.webdataset:WebDataset", (".tar",), ("**/*.tar",)
     ),
-    "images": FormatRow("images", "lidarpool.clouds.images:ImageFolder", folders=("*/*.npz",)),
+    "images": FormatRow("images", "lidarfiles.clouds.images:ImageFolder", folders=("*/*.npz",)),
     "pcap": FormatRow(
-        "packets", "lidarpool.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
+        "packets", "lidarfiles.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
     ),
-    "rrd": FormatRow("cloud.rrd", "lidarpool.clouds.rrd:RRD", packages=("rerun",), extra="rerun"),
+    "rrd": FormatRow("cloud.rrd", "lidarfiles.clouds.rrd:RRD", packages=("rerun",), extra="rerun"),
     # Readers derive the message type from the suffix "_sd" in the file name.
-    "osi": FormatRow("cloud_sd.osi", "lidarpool.clouds.osi:OSI", **_OSI),
-    "osi_mcap": FormatRow("cloud_osi.mcap", "lidarpool.clouds.osi:OSIInMCAP", **_OSI),
-    "mcap": FormatRow("cloud.mcap", "lidarpool.clouds.ros.bags:MCAP", (".mcap",), **_ROS),
+    "osi": FormatRow("cloud_sd.osi", "lidarfiles.clouds.osi:OSI", **_OSI),
+    "osi_mcap": FormatRow("cloud_osi.mcap", "lidarfiles.clouds.osi:OSIInMCAP", **_OSI),
+    "mcap": FormatRow("cloud.mcap", "lidarfiles.clouds.ros.bags:MCAP", (".mcap",), **_ROS),
     "rosbag2": FormatRow(
-        "rosbag2", "lidarpool.clouds.ros.bags:Rosbag2", folders=("metadata.yaml",), **_ROS
+        "rosbag2", "lidarfiles.clouds.ros.bags:Rosbag2", folders=("metadata.yaml",), **_ROS
     ),
 }
 _READ_ONLY = FormatRow(
     "",
-    "lidarpool.clouds.text_and_arrays:TextFormats",
+    "lidarfiles.clouds.text_and_arrays:TextFormats",
     suffixes=(".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".npy"),
 )
 DATA_SETS = {  # {format of a data set: format of its jobs}

@@ -20,9 +20,9 @@ from lidarsim.words import join_names
 
 from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
-from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
+from ..parts.parts import StoredCloud
 
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .xyz, .txt, "

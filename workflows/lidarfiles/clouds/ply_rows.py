@@ -12,7 +12,7 @@ from lidarsim.columns.ply_format import as_file_type
 from lidarsim.columns.table import AXES, Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints32
 
-from ..columns.part_blocks import BlockMemory
+from ..parts.part_blocks import BlockMemory
 from .ply_loops import TILE_ROWS, make_rows
 
 _SIZES = (1, 2, 4, 8)  # sizes of integers in bytes

@@ -14,8 +14,8 @@ from lidarsim.packets.encoders import START_NS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks, simplify_scene
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 
+from ..picture_file import PictureContent
 from .boxes import Boxes
 from .frame_names import VEHICLE, WORLD, frame_names, points_topic, survey_start_ns
 

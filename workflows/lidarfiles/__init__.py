@@ -1,0 +1,1 @@
+"""Files of lidars: point clouds, recordings, data sets, and resumable work on them."""

@@ -1,0 +1,1 @@
+"""Fingerprints, checksums and versions, which identify files and results."""
