@@ -45,8 +45,8 @@ from lidarpool.run.pipeline.task_records import Recorder
 from lidarpool.run.progress import Screen
 from lidarpool.run.run_page import RunPage
 from lidarpool.run.store.run_store import RUN_FOLDER
-from lidarpool.scenario.job import Job
-from lidarpool.scenario.sections import TaskOptions
+from lidarscenario.job import Job
+from lidarscenario.sections import TaskOptions
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.io.storage import Storage
 from lidarsim.scene.actors import box

@@ -148,7 +148,7 @@ def view(path):
 
 def read_scene(path):
     """Read points as `lidarpool scene points` does before it makes surfels."""
-    from lidarpool.scenario.point_files import read_points
+    from lidarscenario.points.point_files import read_points
 
     points = read_points(path, None, lambda _: None)
     return len(points[0] if isinstance(points, tuple) else points)

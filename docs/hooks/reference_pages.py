@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.schema import campaign_schema, scenario_schema, vehicle_schema
+from lidarscenario.schema import campaign_schema, scenario_schema, vehicle_schema
 from lidarsim.columns.ply_format import file_type
 from lidarsim.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 

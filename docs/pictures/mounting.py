@@ -13,9 +13,9 @@ import yaml
 from docs.pictures.options import IMAGES, folder_parser
 from PIL import Image
 
-from lidarpool.mounting.pictures import draw_all
-from lidarpool.mounting.study import MountStudy
-from lidarpool.scenario.mount_sections import VehicleFile
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.mounting.pictures import draw_all
+from lidarscenario.mounting.study import MountStudy
 
 GUIDE = IMAGES.parent / "how-to/mount.md"
 SHOWN = ("blind", "comparison", "points", "detection")

@@ -17,7 +17,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from lidarpool.occupancy.layouts import SemanticKitti
+from lidarscenario.occupancy.layouts import SemanticKitti
 from lidarsim.numerics.arrays import Bools, Integers
 
 SWEEP = "000005"

@@ -38,8 +38,8 @@ import lidarpool
 from lidarpool import Campaign, LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.report.campaign_output import verify_dataset
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.io.storage import Storage
 
 BASE = """

@@ -27,8 +27,8 @@ from lidarpool import (
 )
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.playback.pcap_recording import PcapRecording
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from raybeam.compiled import compiled
 
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}

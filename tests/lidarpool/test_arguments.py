@@ -63,8 +63,8 @@ from lidarpool import (
     twin,
 )
 from lidarpool.run.options import RunKeywords, RunOptions
-from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.sections import PoolSection
+from lidarscenario.scenario import Scenario
+from lidarscenario.sections import PoolSection
 
 POINTS = np.eye(3)
 FACES = np.array([[0, 1, 2]])

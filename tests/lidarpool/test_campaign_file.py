@@ -13,10 +13,10 @@ import pytest
 import yaml
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey, load_sensor
-from lidarpool.scenario.campaign_file import is_campaign
-from lidarpool.scenario.campaign_jobs import file_hashes
-from lidarpool.scenario.campaign_sections import JobRandom
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.campaign.campaign_jobs import file_hashes
+from lidarscenario.campaign.campaign_sections import JobRandom
+from lidarscenario.scenario import Scenario
 from lidarsim.sensor.models import model_names
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

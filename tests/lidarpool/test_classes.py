@@ -24,10 +24,10 @@ from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.picture_file import PICTURE_FILE, PictureContent
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.report.charts import draw_sweep
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.field_paths import find_field
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.field_paths import find_field
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.viewer.result_views import open_result

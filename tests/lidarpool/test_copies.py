@@ -9,8 +9,8 @@ from tests.shapes import quad
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError, Pose, Scene, SceneMesh
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.media.materials import MaterialTable
 
@@ -182,7 +182,7 @@ def test_materials_and_classes_are_those_of_the_names(made):
 
 
 def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
-    from lidarpool.scenario import static_scene as module
+    from lidarscenario import static_scene as module
 
     read = []
     plain = module.load_objects
@@ -235,7 +235,7 @@ WRONG = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
-    monkeypatch.setattr("lidarpool.scenario.static_scene.MAX_DRAWS", 0)
+    monkeypatch.setattr("lidarscenario.static_scene.MAX_DRAWS", 0)
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from lidarfiles.parts.parts import part_name
 from lidarpool import LidarError, Planning
-from lidarpool.plan import run_trial
 from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
+from lidarscenario.plan import run_trial
 
 SCANS = 20
 

@@ -17,11 +17,11 @@ from trimesh import creation
 
 from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.default_poses import place_sensor, poses_around
-from lidarpool.scenario.plausibility import plausibility_warnings
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.default_poses import place_sensor, poses_around
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.floor import floor_and_ceiling
 from lidarscenes.procedural.plants import SPECIES, tree

@@ -8,8 +8,8 @@ import pytest
 from lidarfiles.identity.field_words import describe_changes, describe_fields
 from lidarpool import Planning
 from lidarpool.run.job_source import describe_inputs
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.words import format_rounded
 
 POSES = [[x, 0, 1] for x in range(30)]

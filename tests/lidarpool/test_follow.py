@@ -36,7 +36,7 @@ from lidarpool.following.node import FollowOptions
 from lidarpool.following.notices import Notices
 from lidarpool.following.opening import FollowSources, create_node
 from lidarpool.following.pose_input import is_wanted
-from lidarpool.scenario.sensors_file import SensorsFile
+from lidarscenario.sensors_file import SensorsFile
 from lidarsim.motion.rotations import matrices
 
 DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet

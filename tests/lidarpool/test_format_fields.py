@@ -41,8 +41,8 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.io.yamlfile import load_yaml

@@ -27,8 +27,8 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.io.yamlfile import load_yaml

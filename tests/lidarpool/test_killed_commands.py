@@ -29,14 +29,14 @@ from lidarpool.augmentation.sweep_tasks import PartProcess, RecordingFile
 from lidarpool.augmentation.variants import CampaignVariants, Variants
 from lidarpool.comparing.comparison_files import write_comparison
 from lidarpool.comparing.fit import charts, fitting
-from lidarpool.mounting import pictures
-from lidarpool.mounting.evaluation import MountEvaluator, MountResult
-from lidarpool.mounting.study_files import rank_mounts
-from lidarpool.occupancy import writing
 from lidarpool.reconstruction import building
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
 from lidarpool.report.result_pictures import publish_pictures
+from lidarscenario.mounting import pictures
+from lidarscenario.mounting.evaluation import MountEvaluator, MountResult
+from lidarscenario.mounting.study_files import rank_mounts
+from lidarscenario.occupancy import writing
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
 from lidarsim.simulator.occupancy import VoxelGrid

@@ -13,9 +13,9 @@ from tests.drives import points_of, the_scene, the_sweeps
 from lidarfiles.clouds.format_table import FORMATS, load_format
 from lidarfiles.clouds.writing import ExportSpec
 from lidarpool.pages.preview import first_sweeps
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city as city_scene
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.sweeps.sweeps import Sweeps

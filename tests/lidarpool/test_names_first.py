@@ -6,8 +6,8 @@ from click.testing import CliRunner
 from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 
 
@@ -19,7 +19,7 @@ def unread(monkeypatch):
         raise AssertionError("read before names were checked")
 
     for place in (
-        "lidarpool.scenario.prepare.read_static_scene",
+        "lidarscenario.prepare.read_static_scene",
         "lidarpool.comparing.fit.fitting.as_recording",
         "lidarpool.reconstruction.building.RecordedSweeps.open",
     ):

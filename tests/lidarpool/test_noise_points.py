@@ -9,7 +9,7 @@ from lidarpool import Comparison, LidarError, Scene, compare
 from lidarpool.cli.compare_command import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.pages.opened import open_view
-from lidarpool.scenario.point_scene import scene_from_points
+from lidarscenario.points.point_scene import scene_from_points
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")

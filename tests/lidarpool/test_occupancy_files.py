@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool.cli.commands import cli
-from lidarpool.occupancy.class_names import occ3d_class
-from lidarpool.occupancy.writing import OccupancySettings, write_occupancy
+from lidarscenario.occupancy.class_names import occ3d_class
+from lidarscenario.occupancy.writing import OccupancySettings, write_occupancy
 from lidarsim import LidarError
 
 SCENARIO = """

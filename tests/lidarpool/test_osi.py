@@ -23,9 +23,9 @@ from lidarpool import (
     box,
     save_cloud,
 )
-from lidarpool.scenario.osi_trace import iter_ground_truth
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.traffic.osi_trace import iter_ground_truth
 from lidarsim.columns.table import SCAN
 from lidarsim.io import allowance
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -23,8 +23,8 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.columns.table import SCAN, TABLE
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

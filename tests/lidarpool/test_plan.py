@@ -15,9 +15,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from lidarpool import LidarError, Planning
-from lidarpool.plan import Trial, best, run_trial, shortest_path_length
-from lidarpool.plan.cost import PathCost
-from lidarpool.plan.geometry import clearance, segment_distances
+from lidarscenario.plan import Trial, best, run_trial, shortest_path_length
+from lidarscenario.plan.cost import PathCost
+from lidarscenario.plan.geometry import clearance, segment_distances
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
 DEFAULT = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0)

@@ -15,19 +15,19 @@ from tests.shapes import level, quad
 from tests.simulated_drives import simulated_points
 
 from lidarpool import LidarError, Mounted, Scene, Survey, Track, load_sensor
-from lidarpool.plan.flight import plan_flight
-from lidarpool.plan.flight_area import read_area, transform_shape, utm_epsg
-from lidarpool.plan.flight_density import (
+from lidarscenario.plan.flight import plan_flight
+from lidarscenario.plan.flight_area import read_area, transform_shape, utm_epsg
+from lidarscenario.plan.flight_density import (
     DensityMap,
     Squares,
     expected_density,
     is_inside_grid,
     summarize_density,
 )
-from lidarpool.plan.flight_files import to_geojson, to_kml
-from lidarpool.plan.flight_lines import Terrain
-from lidarpool.plan.flight_path import FlightLeg, fly, shortest_turn, turn_radius_m
-from lidarpool.plan.flight_scanner import AirborneScanner
+from lidarscenario.plan.flight_files import to_geojson, to_kml
+from lidarscenario.plan.flight_lines import Terrain
+from lidarscenario.plan.flight_path import FlightLeg, fly, shortest_turn, turn_radius_m
+from lidarscenario.plan.flight_scanner import AirborneScanner
 
 SQUARE = shapely.box(0, 0, 1000, 1000)
 RIEGL = "airborne/riegl-vq780i"  # 60°, 666,600 pulses per second on average, 20 to 300 Hz
@@ -393,7 +393,7 @@ def test_the_expected_density_may_come_from_a_part_of_the_rays(monkeypatch):
     area = [[(20, -80), (140, -80), (140, 80), (20, 80)]]
     every_ray = summarize_density(expected_density(scene, survey, area), 2.0)
     assert survey.ray_count > 50_000
-    monkeypatch.setattr("lidarpool.plan.flight_density.SAMPLED_RAYS", 10_000)
+    monkeypatch.setattr("lidarscenario.plan.flight_density.SAMPLED_RAYS", 10_000)
     sampled = summarize_density(expected_density(scene, survey, area), 2.0)
     assert sampled.mean_m2 == pytest.approx(every_ray.mean_m2, rel=0.02)
     assert sampled.low_m2 == pytest.approx(every_ray.low_m2, rel=0.2)

@@ -10,7 +10,7 @@ from tests.shapes import block, level, quad, wall
 
 from lidarpool import LidarError, Scene, SceneMesh, Sensor, box, load_sensor
 from lidarpool.cli.commands import cli
-from lidarpool.plan.stations import (
+from lidarscenario.plan.stations import (
     StationVisibility,
     candidates,
     plan_stations,

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from tests.shapes import block
 
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene import Scene
 

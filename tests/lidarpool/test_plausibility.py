@@ -13,11 +13,11 @@ from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
 from lidarpool import Scanner, Scene, SceneMesh, load_sensor
-from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.campaign_file import is_campaign
-from lidarpool.scenario.plausibility import plausibility_warnings
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.paint import paint_scene
 from lidarscenes.writers.scene_file import write_scene

@@ -15,11 +15,11 @@ from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.identity.software import describe_difference
-from lidarpool.scenario.campaign_jobs import file_hashes
-from lidarpool.scenario.point_files import read_points
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import scenario_schema
+from lidarscenario.campaign.campaign_jobs import file_hashes
+from lidarscenario.points.point_files import read_points
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.schema import scenario_schema
 from lidarsim.environment.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
 

@@ -9,7 +9,7 @@ from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import open_view
-from lidarpool.scenario.point_scene import scene_from_points
+from lidarscenario.points.point_scene import scene_from_points
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.pcd import pcd_bytes
 
@@ -464,7 +464,7 @@ def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):
 
 def test_too_many_points_are_refused_before_they_are_read(tmp_path, monkeypatch):
     path = written(tmp_path / "a.las", plane())
-    monkeypatch.setattr("lidarpool.scenario.point_files.memory", lambda: 100_000)
+    monkeypatch.setattr("lidarscenario.points.point_files.memory", lambda: 100_000)
     monkeypatch.setattr("laspy.LasReader.read_points", None)
     with pytest.raises(LidarError, match=r"a\.las: it has 1,200 points, which require 820\.31 kiB"):
         scene_from_points(path)
@@ -666,7 +666,7 @@ def test_the_command_says_what_is_not_kept(tmp_path):
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
-    monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
+    monkeypatch.setattr("lidarscenario.points.point_scene.memory", lambda: 1_000_000)
     with pytest.raises(LidarError, match=r"1,200 surfels, .* Increase `voxel_m`, which is 0.01"):
         scene_from_points(path, voxel_m=0.01)
     assert len(scene_from_points(path, voxel_m=0.3).faces) < 2 * 500

@@ -25,7 +25,7 @@ from lidarpool import (
 from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.pages.recorded import recorded_view
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.scenario.point_files import read_points
+from lidarscenario.points.point_files import read_points
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -31,8 +31,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.plan import best
-from lidarpool.plan.trial import run_trial
 from lidarpool.report.page.rendering import (
     MAX_ROWS,
     draw_top_view,
@@ -44,7 +42,9 @@ from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SOR
 from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.planning_trials import TRIAL
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.plan import best
+from lidarscenario.plan.trial import run_trial
+from lidarscenario.scenario import Scenario
 from lidarview.page_templates import sentence
 
 EVIL = (

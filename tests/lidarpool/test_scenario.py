@@ -27,11 +27,11 @@ from lidarpool import (
     Survey,
     box,
 )
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.demo import demo_scenario
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.static_scene import SceneCache
+from lidarscenario.advice import advice
+from lidarscenario.demo import demo_scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.static_scene import SceneCache
 from lidarsim.media.materials import MaterialTable, SurfaceKinds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -13,11 +13,11 @@ from jsonschema import Draft202012Validator
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError
-from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.campaign_file import is_campaign
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import (
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.schema import (
     campaign_schema,
     scenario_schema,
     scenario_template,

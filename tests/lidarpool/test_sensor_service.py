@@ -23,8 +23,8 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scanner, Track, load_sensor
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.motion.rotations import quaternions_of
 
 grpc = pytest.importorskip("grpc")

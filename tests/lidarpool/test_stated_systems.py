@@ -12,9 +12,9 @@ from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import growing_view, open_view
-from lidarpool.scenario.point_scene import scene_from_points
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.points.point_scene import scene_from_points
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files import coordinate_systems
 

@@ -6,8 +6,8 @@ from click.testing import CliRunner
 
 from lidarpool import Pose, Scanner, Scene, Sensor, box
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scenario.point_scene import points_to_scene
-from lidarpool.scenario.surfel_gaps import expected_loss
+from lidarscenario.points.point_scene import points_to_scene
+from lidarscenario.points.surfel_gaps import expected_loss
 
 pytest.importorskip("open3d", reason="Open3D does not exist")
 

@@ -16,7 +16,7 @@ from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.porosity import Porosity
 from lidarpool.scan_patterns.lasers import RingLasers
-from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
+from lidarscenario.points.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials
 

@@ -27,9 +27,9 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.report.picture_content import picture_content
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.casting.surfaces import SceneSurfaces
 from lidarsim.io import allowance
 from lidarsim.simulator.rig import Rig

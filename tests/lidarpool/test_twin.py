@@ -41,8 +41,8 @@ from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.scan_patterns.lasers import RingLasers
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN

@@ -25,8 +25,8 @@ from lidarpool import (
 from lidarpool.reconstruction.outlines import Extents, crossed_cells
 from lidarpool.reconstruction.porosity import Crossings
 from lidarpool.reconstruction.surfels import Surfels, surfel_mesh
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")

@@ -10,8 +10,8 @@ from tests.simulated_drives import simulated_drive, simulated_points
 
 from lidarpool import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, twin
 from lidarpool.reconstruction.porosity import Crossings, Porosity
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 pytest.importorskip("scipy")
 

@@ -23,8 +23,8 @@ from lidarpool import (
     box,
     twin,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.extended

@@ -35,7 +35,7 @@ from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarpool.reconstruction.vehicle_returns import VehicleReturns
 from lidarpool.reconstruction.visibility import estimate_visibility
 from lidarpool.scan_patterns.lasers import RingLasers
-from lidarpool.scenario.point_scene import CLASS_MATERIAL
+from lidarscenario.points.point_scene import CLASS_MATERIAL
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.materials import extinction
 from lidarsim.scene.colors import Colors

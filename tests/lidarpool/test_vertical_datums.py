@@ -9,9 +9,9 @@ import pytest
 
 from lidarpool import LidarError, compare_strips, compare_surveys
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.point_scene import scene_from_points
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.points.point_scene import scene_from_points
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.scene import Scene

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarpool import Sensor, load_sensor
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.sensor.export import fired_rays
 from lidarsim.sensor.optics import Optics
 

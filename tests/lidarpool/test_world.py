@@ -18,11 +18,11 @@ from lidarfiles.clouds.writing import ExportSpec
 from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.pages.preview import first_sweeps
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.empty_cloud import empty_cloud_reason
-from lidarpool.scenario.plausibility import plausibility_warnings
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.empty_cloud import empty_cloud_reason
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.scene.files.stated_system import StatedSystem
 
 ORIGIN = [500_000, 5_400_000]

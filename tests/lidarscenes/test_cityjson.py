@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim import LidarError, SceneInstance
 from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.files import coordinate_systems

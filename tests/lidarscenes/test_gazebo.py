@@ -13,8 +13,8 @@ from tests.lidarscenes.test_robots import DAE
 
 from lidarpool import LidarError, Scene, load_sensor
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

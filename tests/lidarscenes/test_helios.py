@@ -13,9 +13,9 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.point_scene import surfel_mesh
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.points.point_scene import surfel_mesh
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.helios import ImportedSurvey, import_survey
 from lidarsim.media.materials import MaterialTable
 from lidarsim.simulator.rig import Rig

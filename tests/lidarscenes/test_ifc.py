@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tests.fork_server import IFCOPENSHELL, ForkServer
 
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.files import ifc as reader
 from lidarsim import LidarError, Scene, SceneInstance

@@ -16,8 +16,8 @@ from tests.fork_server import ForkServer
 
 from lidarpool import LidarError, MujocoScanner, Scanner, Scene, Sensor
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.mujoco import model_file
 from lidarsim import SceneInstance

@@ -13,9 +13,9 @@ from tests.shapes import level, made
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim import Mounted, box
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.numerics.vectors import rotate_into_frames

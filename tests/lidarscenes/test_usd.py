@@ -18,9 +18,9 @@ from PIL import Image
 from tests.fork_server import USD_CORE, ForkServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
 from lidarsim import LidarError, SceneInstance
 from lidarsim.columns.table import COLORS

@@ -138,7 +138,7 @@ import re, sys
 from pathlib import Path
 import distributed, DracoPy
 from lidarpool import LidarError, Scene, load_sensor
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.scenario import Scenario
 
 READERS = {
     "sensor.yaml": load_sensor,

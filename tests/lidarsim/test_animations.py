@@ -13,9 +13,9 @@ from tests.shapes import made
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.picture_file import PictureContent
 from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim import Cloud, SceneMesh, box
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import distinct_meshes, join_meshes

@@ -36,7 +36,7 @@ from lidarpool import (
     Sensor,
     Track,
 )
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.scenario import Scenario
 from lidarsim.columns.table import COLORS
 from lidarsim.media.materials import DARKEST, reflectances
 from lidarsim.scene import masks

@@ -13,9 +13,9 @@ from tests.shapes import beam_along_x, cast, wall
 
 from lidarpool import LidarError, Material, Mounted, Noise, Returns, Survey, load_sensor
 from lidarpool.cli.scenario_commands import sensors
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import Detection, read_model
 

@@ -28,8 +28,8 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.columns.table import SCAN
 from lidarsim.pulses.steps.stray_light import BLOOMING

@@ -33,9 +33,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim import Cloud
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

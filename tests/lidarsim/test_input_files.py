@@ -13,10 +13,10 @@ import trimesh
 
 from lidarfiles.clouds.format_table import point_suffixes
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
-from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.point_scene import scene_from_points, surfel_mesh
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.points.point_scene import scene_from_points, surfel_mesh
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.helios import import_survey
 from lidarsim import LidarError
 from lidarsim.io.input_files import open_input, read_input, read_input_text

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scenario.point_scene import scene_from_points
+from lidarscenario.points.point_scene import scene_from_points
 from lidarsim import LidarError, Scene
 from lidarsim.scene.files import coordinate_systems
 

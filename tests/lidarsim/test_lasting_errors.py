@@ -9,8 +9,8 @@ import pytest
 from tests.shapes import wall
 
 from lidarpool import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 

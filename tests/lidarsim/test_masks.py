@@ -451,8 +451,8 @@ def test_actors_have_opaque_and_masked_parts(backend):
 
 
 def test_a_scenario_ignores_masks_if_told(tmp_path):
-    from lidarpool.scenario.prepare import prepare
-    from lidarpool.scenario.scenario import Scenario
+    from lidarscenario.prepare import prepare
+    from lidarscenario.scenario import Scenario
 
     header, body = card()
     write(tmp_path / "m.glb", glb(header, body))

@@ -27,9 +27,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.motion.navigation import gnss_fixes, imu_samples, to_geodetic
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Stations

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.advice import advice
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim import LidarError, Scene, SceneMesh
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import UP_AXES, Transform

@@ -21,8 +21,8 @@ from click.testing import CliRunner
 
 from lidarpool.cli.commands import cli
 from lidarpool.cli.import_plugins import import_atomically
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.gazebo.import_world import import_world
 from lidarscenes.helios import import_scanner, is_scanner
 from lidarscenes.sensors.import_sensor import import_sensor

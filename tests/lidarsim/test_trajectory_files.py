@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from lidarpool import LidarError, Pose, Track, load_trajectory
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 # Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
 HEAD = "time_s,x,y,z"

@@ -23,8 +23,8 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim import SceneMesh
 from lidarsim.media.leaves import mean_projection

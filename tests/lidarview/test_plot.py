@@ -29,9 +29,9 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.plan import best
-from lidarpool.plan.trial import run_trial
 from lidarpool.report.picture_content import planning_picture
+from lidarscenario.plan import best
+from lidarscenario.plan.trial import run_trial
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 from lidarview.render.picture_page import Page

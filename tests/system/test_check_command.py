@@ -34,8 +34,8 @@ from lidarpool import (
 )
 from lidarpool.run.forecast import forecast
 from lidarpool.run.options import RunOptions
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.rig import Rig

@@ -125,7 +125,7 @@ WITH_OTHERS = {
 OPTIONAL = {
     "DracoPy": ("lidarsim/scene/files/gltf_draco.py",),
     "IPython": ("lidarsim/environment/notebook.py",),
-    "betterosi": ("lidarfiles/clouds/osi.py", "lidarpool/scenario/osi_trace.py"),
+    "betterosi": ("lidarfiles/clouds/osi.py", "lidarscenario/traffic/osi_trace.py"),
     "cuda": ("raybeam/cuda_backend.py",),
     "cupy": ("raybeam/cuda_backend.py",),
     "cyclonedds": ("lidarpool/playback/dds.py", "lidarpool/playback/serialized_topics.py"),
@@ -154,7 +154,7 @@ OPTIONAL = {
     "pye57": ("lidarfiles/clouds/e57",),
     "rasterio": (
         "lidarfiles/clouds/navigation_files.py", "lidarfiles/clouds/well_known_text.py",
-        "lidarpool/plan/flight_area.py", "lidarscenes/files/rasters.py",
+        "lidarscenario/plan/flight_area.py", "lidarscenes/files/rasters.py",
         "lidarsim/scene/files/coordinate_systems.py", "lidarsim/scene/files/stated_system.py",
     ),
     "rerun": ("lidarfiles/clouds/rrd.py", "lidarpool/viewers/rerun_server.py"),
@@ -163,7 +163,7 @@ OPTIONAL = {
         "lidarpool/following/pose_input.py", "lidarpool/playback/dds.py",
         "lidarsim/columns/bags.py", "lidarsim/columns/closing_bag.py",
     ),
-    "shapely": ("lidarpool/plan/flight_",),
+    "shapely": ("lidarscenario/plan/flight_",),
     "small_gicp": ("lidarpool/reconstruction/odometry.py",),
     "torch": ("lidarpool/comparing/lidar4d.py", "lidarfiles/datasets/torch_sweeps.py"),
     "velodyne_decoder": ("lidarsim/packets/velodyne.py",),

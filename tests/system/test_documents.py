@@ -46,13 +46,13 @@ from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
 from lidarfiles.datasets.dataset import DATA_SETS
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.campaign_sections import CampaignSection
-from lidarpool.scenario.mount_sections import VehicleFile
-from lidarpool.scenario.plausibility import plausibility_warnings
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import campaign_schema, scenario_schema, vehicle_schema
-from lidarpool.scenario.sensors_file import SensorsFile
+from lidarscenario.campaign.campaign_sections import CampaignSection
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.schema import campaign_schema, scenario_schema, vehicle_schema
+from lidarscenario.sensors_file import SensorsFile
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings, option_names
 from lidarsim.schema.model_names import model_names

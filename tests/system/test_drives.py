@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lidarpool import Campaign, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.simulator.rig import Rig

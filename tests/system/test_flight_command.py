@@ -8,7 +8,7 @@ import yaml
 from PIL import Image
 
 from lidarpool import read_cloud
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.scenario import Scenario
 from lidarsim.motion.trajectory_files import load_trajectory
 
 FLIGHT = ("--sensor", "riegl-vq780i", "--agl", "120", "--speed", "10-20", "--density", "4")

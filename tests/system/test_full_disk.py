@@ -14,8 +14,8 @@ from distributed import Client
 from lidarpool import LidarError, save_cloud, simulate
 from lidarpool.report.result_files import FILES
 from lidarpool.run import forecast
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 SCENARIO = """
 scene: seed

@@ -16,8 +16,8 @@ from distributed import Client
 from tests import killed_drivers
 
 from lidarpool import LidarError, ScanFrame, Scene, Sensor, Survey, remove_run, save_cloud, simulate
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 

@@ -9,8 +9,8 @@ import trimesh
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 
 def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):

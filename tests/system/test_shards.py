@@ -20,8 +20,8 @@ from lidarfiles.clouds.format_table import DATA_SETS
 from lidarfiles.datasets.job_seconds import read_seconds
 from lidarfiles.identity.sealed import seal_json, unseal_json
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps
-from lidarpool.identity.shard import Shard
 from lidarpool.report.campaign_output import verify_dataset
+from lidarscenario.shard import Shard
 from lidarsim.io.storage import Storage
 
 CAMPAIGN = """

@@ -18,8 +18,8 @@ from lidarpool import LidarError, Planning, ScanSpec, Scene, Sensor, Survey, sim
 from lidarpool.processes.shared_memory import SharedHandle
 from lidarpool.run.pipeline.casting_workers import INLINE_BYTES
 from lidarpool.run.pipeline.stage_messages import ScanRange
-from lidarpool.scenario.demo import demo_scenario
-from lidarpool.scenario.prepare import prepare
+from lidarscenario.demo import demo_scenario
+from lidarscenario.prepare import prepare
 from poolpart import Pool
 
 LONG_S = 60.0  # for what happens at once, or the test fails

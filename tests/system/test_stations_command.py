@@ -11,8 +11,8 @@ from PIL import Image
 
 from lidarfiles.clouds.folder import result_folder
 from lidarpool.report.result_pictures import COLORS, COVERED, OTHER, UNCOVERED
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("pictures")
 

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from lidarfiles.clouds.writing import save_cloud
     from lidarfiles.datasets.loader import sweeps
     from lidarfiles.recordings.opening import open_recording
+    from lidarscenario.job import Job
+    from lidarscenario.plan import Plan, Planning
     from lidarscenes.robots.robot import Robot
     from lidarscenes.robots.urdf import load_robot
     from lidarsim.columns.cloud import Cloud
@@ -46,7 +48,6 @@ if TYPE_CHECKING:
     from .comparing.surveys import SurveyComparison, compare_strips, compare_surveys
     from .comparing.two_clouds import compare
     from .pages.scanner_page import show
-    from .plan import Plan, Planning
     from .playback.live import play
     from .reconstruction.building import twin
     from .reconstruction.twin import Twin
@@ -55,7 +56,6 @@ if TYPE_CHECKING:
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
     from .scan_patterns import PatternFit, fit_pattern
-    from .scenario.job import Job
     from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [

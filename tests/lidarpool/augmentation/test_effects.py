@@ -12,7 +12,7 @@ from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.insertions import load_insertion
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.scenario import Scenario
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import Weather
 from lidarsim.pulses.steps.step import Role

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from lidarpool import LidarError, Pose, Scene, SceneMesh, box
-from lidarpool.mounting.placements import azimuths_in_view, pack_sweeps
-from lidarpool.mounting.study import MountStudy
-from lidarpool.scenario.mount_sections import VehicleFile
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.mounting.placements import azimuths_in_view, pack_sweeps
+from lidarscenario.mounting.study import MountStudy
 from lidarscenes.writers.scene_file import write_scene
 
 POST = {"box": [0.2, 0.2, 0.2]}  # a body that hides almost nothing

@@ -13,9 +13,9 @@ from distributed import Client
 import poolpart.deploy
 from lidarpool import read_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.mounting.study import MountStudy
-from lidarpool.mounting.study_files import rank_mounts, write_study
-from lidarpool.scenario.mount_sections import VehicleFile
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.mounting.study import MountStudy
+from lidarscenario.mounting.study_files import rank_mounts, write_study
 
 VEHICLE = {
     "body": "saloon",

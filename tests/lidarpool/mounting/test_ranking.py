@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from lidarpool import Pose
-from lidarpool.mounting.blind_loops import BeamSegments, CellGrid, lower_to_beams
-from lidarpool.mounting.evaluation import MountResult
-from lidarpool.mounting.placements import Placements, Target, grid_placements, pack_sweeps
-from lidarpool.mounting.ranking import (
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.mounting.blind_loops import BeamSegments, CellGrid, lower_to_beams
+from lidarscenario.mounting.evaluation import MountResult
+from lidarscenario.mounting.placements import Placements, Target, grid_placements, pack_sweeps
+from lidarscenario.mounting.ranking import (
     MountCandidate,
     RankingRules,
     evaluate_candidate,
@@ -19,8 +20,7 @@ from lidarpool.mounting.ranking import (
     points_by_position,
     rank_candidates,
 )
-from lidarpool.mounting.search import CandidateSearch
-from lidarpool.scenario.mount_sections import VehicleFile
+from lidarscenario.mounting.search import CandidateSearch
 from lidarsim import box
 from lidarsim.sensor import Sensor
 

@@ -13,10 +13,10 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.mounting.search import listed_candidates
-from lidarpool.scenario.mount_sections import VehicleFile
-from lidarpool.scenario.prepare import prepare
-from lidarpool.scenario.scenario import Scenario
+from lidarscenario.mount_sections import VehicleFile
+from lidarscenario.mounting.search import listed_candidates
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.road_users import ROAD_USERS
 from lidarsim.schema.vocabulary import BODIES, TARGETS
 
@@ -243,7 +243,7 @@ def test_workers_are_not_combined_with_a_cluster(folder):
 @pytest.mark.extended
 def test_ranges_are_searched_with_the_stated_seed(folder):
     """Of heights from 0.6 to 2.2 m and pitches of up to 20°, a lone sensor sees most from above."""
-    from lidarpool.mounting.study import MountStudy
+    from lidarscenario.mounting.study import MountStudy
 
     data = {
         **SMALL,
@@ -285,7 +285,7 @@ actors:
 
 
 def test_a_missing_scenario_is_reported_with_its_field(folder):
-    from lidarpool.mounting.study import MountStudy
+    from lidarscenario.mounting.study import MountStudy
 
     Path("file.yaml").write_text("")
     data = {"body": "saloon", "sensors": sensors([0, 0, 1.8]), "traffic": "drive.yaml"}
@@ -314,7 +314,7 @@ def test_traffic_is_in_the_report(folder):
 
 def test_targets_follow_the_traffic_of_a_scenario(folder):
     """A parked car at (15, 6) is 15 m ahead at the start, and 5 m ahead after 1 s."""
-    from lidarpool.mounting.study import MountStudy
+    from lidarscenario.mounting.study import MountStudy
 
     Path("drive.yaml").write_text(DRIVE)
     data = {"body": "saloon", "sensors": sensors([0, 0, 1.8])}

@@ -7,6 +7,10 @@ from pathlib import Path
 from typing import Unpack
 
 from lidarfiles.clouds.folder import output_destination
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.job import Job
+from lidarscenario.plan import Planning
+from lidarscenario.shard import Shard
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
@@ -16,9 +20,7 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.survey.survey import Survey
 from lidarsim.words import did_you_mean
 
-from ..identity.shard import Shard
 from ..pages import page_of
-from ..plan import Planning
 from ..report.campaign_output import run_campaign
 from ..run.job_source import SingleJob
 from ..run.options import RunKeywords, RunOptions, check_keywords
@@ -28,8 +30,6 @@ from ..run.run_result import CampaignRun, RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
-from ..scenario.campaign import CampaignSpec
-from ..scenario.job import Job
 from .result import Result
 
 # Run options that a call does not accept. A survey has no data set. A campaign does not plan paths,

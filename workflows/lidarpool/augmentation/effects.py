@@ -8,6 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.prepare import prepare_actors
+from lidarscenario.scenario import Scenario
 from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.media.materials import Material
@@ -22,9 +25,6 @@ from lidarsim.sensor.optics import Mode
 from lidarsim.survey.faults import Fault
 from lidarsim.words import did_you_mean
 
-from ..scenario.campaign_file import is_campaign
-from ..scenario.prepare import prepare_actors
-from ..scenario.scenario import Scenario
 from .recorded_sections import check_content, check_sections, check_spray, effect_errors
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from lidarscenario.scenario import Scenario
 from lidarsim.errors import Mistakes
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER
@@ -20,8 +21,6 @@ from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import Mounted, Survey
-
-from ..scenario.scenario import Scenario
 
 SECTIONS = (
     *("weather", "noise", "faults", "returns"),

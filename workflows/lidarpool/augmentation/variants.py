@@ -11,12 +11,12 @@ from pathlib import Path
 
 from lidarfiles.datasets.job_table import Value, format_cell
 from lidarfiles.identity.fingerprint import fingerprint
+from lidarscenario.campaign.campaign_jobs import SampledJobs, file_hashes
+from lidarscenario.campaign.campaign_sections import CampaignSection, Splits
 from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.error_sentences import convert_validation_errors
 
-from ..scenario.campaign_jobs import SampledJobs, file_hashes
-from ..scenario.campaign_sections import CampaignSection, Splits
 from .effects import Effects, Insertion
 from .recorded_sections import check_sections
 

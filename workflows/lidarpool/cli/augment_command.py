@@ -353,9 +353,10 @@ def _variants(
     allow_empty: bool,
 ) -> Variants:
     """Return the variants of effects in a file, with the effects of options."""
+    from lidarscenario.campaign.campaign_file import is_campaign
+
     from ..augmentation.effects import Effects
     from ..augmentation.variants import CampaignVariants, Variants
-    from ..scenario.campaign_file import is_campaign
 
     sections = _sections(settings)
     seed = settings["seed"]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
+from lidarscenario.shard import ALL
 from lidarsim._version import __version__
 from lidarsim.environment.interrupts import (
     INTERRUPTED,
@@ -30,7 +31,6 @@ from lidarsim.errors import LidarError
 from lidarsim.schema.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from lidarsim.words import plural
 
-from ..identity.shard import ALL
 from ..processes.logs import set_logs
 from ..processes.rare_collections import no_collections
 from ..viewers.viewer_table import PAGE, VIEWERS
@@ -263,7 +263,8 @@ def demo(terminal: Terminal, options: RunOptions, out: Any, extent: str | None) 
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - Click requires the character \b
-    from ..scenario.demo import demo_scenario
+    from lidarscenario.demo import demo_scenario
+
     from .run_command import run_scenario
 
     run_scenario(demo_scenario(), out, terminal, options, extent=extent or "pictures")
@@ -342,11 +343,11 @@ def run(
       lidarpool run examples/campaign.yaml --shard 3/10 --out part-3
       lidarpool run --verify dataset
     """  # noqa: D301 - Click requires the character \b
+    from lidarscenario.campaign.campaign_file import is_campaign
+    from lidarscenario.scenario import Scenario
     from lidarsim.io.storage import Storage
 
     from ..run.store.run_store import RUN_FOLDER
-    from ..scenario.campaign_file import is_campaign
-    from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
     if number is not None and settings["shard"] is not None:
@@ -367,7 +368,7 @@ def run(
             "the files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
-        from ..scenario.campaign import CampaignSpec
+        from lidarscenario.campaign.campaign import CampaignSpec
 
         campaign = CampaignSpec.from_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:

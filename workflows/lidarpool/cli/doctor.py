@@ -17,6 +17,7 @@ from distributed.system import MEMORY_LIMIT
 from packaging.requirements import Requirement
 
 from lidarfiles.open3d_access.open3d_module import load_open3d
+from lidarscenario.sections import TaskOptions
 from lidarsim.environment.extras import CHECKOUT
 from lidarsim.errors import LidarError
 from poolpart import Pool, PoolError
@@ -28,7 +29,6 @@ from raybeam.installation import install_command
 from ..report.report import versions
 from ..run.cluster.requirements import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR
-from ..scenario.sections import TaskOptions
 from .installed_copies import find_second_copy
 
 READY = "ready"

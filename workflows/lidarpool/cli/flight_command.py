@@ -27,12 +27,12 @@ from .planned_scene import (
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
+    from lidarscenario.plan.flight import FlightPlan
+    from lidarscenario.plan.flight_area import Area
+    from lidarscenario.plan.flight_density import AreaDensity
+    from lidarscenario.scenario import Scenario
     from lidarsim.numerics.arrays import Floats
 
-    from ..plan.flight import FlightPlan
-    from ..plan.flight_area import Area
-    from ..plan.flight_density import AreaDensity
-    from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
 SCENARIO_FILE = "flight.yaml"
@@ -207,11 +207,11 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
     as_json = settings.pop("as_json")
     print_first_step("reading the area", quiet=as_json)
     from lidarfiles.clouds.folder import check_not_existing, result_folder
+    from lidarscenario.plan.flight import plan_flight
+    from lidarscenario.plan.flight_area import read_area
+    from lidarscenario.plan.flight_scanner import AirborneScanner
     from lidarsim.schema.model_names import full_name
 
-    from ..plan.flight import plan_flight
-    from ..plan.flight_area import read_area
-    from ..plan.flight_scanner import AirborneScanner
     from .terminal import Terminal
 
     terminal = Terminal(quiet=as_json)
@@ -271,8 +271,8 @@ def _read_site(
     """
     import numpy as np
 
-    from ..plan.flight_area import GEOGRAPHIC, import_shapely, utm_epsg
-    from ..plan.flight_lines import Terrain
+    from lidarscenario.plan.flight_area import GEOGRAPHIC, import_shapely, utm_epsg
+    from lidarscenario.plan.flight_lines import Terrain
 
     shapely = import_shapely()
     if drawn is None and terrain is not None:
@@ -294,7 +294,7 @@ def _read_site(
             origin[:2] = np.floor(np.array(shape.centroid.coords[0]) / _ORIGIN_M) * _ORIGIN_M
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
         return _Site(shape, Terrain(), None, epsg, origin, planned_columns(_FORMATS), [])
-    from ..scenario.scenario import Scenario
+    from lidarscenario.scenario import Scenario
 
     scenario = Scenario.load(source, of_mesh)
     prepared, notes = prepared_with_notes(scenario, terminal)
@@ -327,7 +327,7 @@ def _read_site(
 
 def _in_system(drawn: Any, epsg: int | None) -> Any:
     """Return the shape of an area in the coordinate system of the plan."""
-    from ..plan.flight_area import transform_shape
+    from lidarscenario.plan.flight_area import transform_shape
 
     if drawn.epsg is None:
         return drawn.shape
@@ -363,12 +363,12 @@ def _write_plan(
     `data` is the content of the scenario, and `notes` are written to its head.
     """
     from lidarfiles.work.publishing import publishing
+    from lidarscenario.plan.flight_density import expected_density, summarize_density
+    from lidarscenario.plan.flight_files import to_geojson, to_kml
+    from lidarscenario.prepare import prepare
+    from lidarscenario.scenario import Scenario
 
-    from ..plan.flight_density import expected_density, summarize_density
-    from ..plan.flight_files import to_geojson, to_kml
     from ..report.flight_map import draw_flight
-    from ..scenario.prepare import prepare
-    from ..scenario.scenario import Scenario
 
     with (
         explain_os_errors(f"The plan cannot be written to {folder}", "free some disk space"),

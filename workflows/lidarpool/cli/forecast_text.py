@@ -10,31 +10,31 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarscenario.advice import advice, unlabeled_notes
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.job import Job
+from lidarscenario.plan.flight_density import expected_density, summarize_density
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import PreparedScenario, prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.errors import LidarError
 from lidarsim.io.allowance import bytes_of
 from lidarsim.io.storage import Storage
 from lidarsim.words import format_rounded, format_scan_counts, list_names, plural
 
 from ..identity.job_errors import summarize_errors
-from ..plan.flight_density import expected_density, summarize_density
 from ..report.result_files import check_existing
 from ..run.forecast import forecast
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
-from ..scenario.advice import advice, unlabeled_notes
-from ..scenario.campaign_file import is_campaign
-from ..scenario.job import Job
-from ..scenario.plausibility import plausibility_warnings
-from ..scenario.prepare import PreparedScenario, prepare
-from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from ..scenario.campaign import CampaignSpec
+    from lidarscenario.campaign.campaign import CampaignSpec
 
 FORECAST_JOBS = 5  # number of campaign jobs that are checked
 _JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
@@ -82,7 +82,9 @@ def forecast_scenario(
     """
     campaign = None
     if not of_mesh and is_campaign(path):
-        from ..scenario.campaign import CampaignSpec  # imported late because scenarios need less
+        from lidarscenario.campaign.campaign import (
+            CampaignSpec,  # imported late because scenarios need less
+        )
 
         campaign = CampaignSpec.load(path)
     if campaign is None and number is not None:

@@ -17,8 +17,9 @@ from .first_step import print_first_step
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
+    from lidarscenario.mounting.study import MountRanking
+
     from ..connection.tls_files import TlsFiles
-    from ..mounting.study import MountRanking
 
 _SHOWN = 10  # candidates in the printed table
 
@@ -67,9 +68,14 @@ def mount(
     options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the vehicle", quiet=as_json)
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarscenario.mounting.study import figures_of
+    from lidarscenario.mounting.study_files import (
+        FIGURES_FILE,
+        PAGE_FILE,
+        SCENARIO_FILE,
+        rank_mounts,
+    )
 
-    from ..mounting.study import figures_of
-    from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, rank_mounts
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

@@ -134,10 +134,10 @@ def occupancy(
     options.check_unfinished(resume=resume, restart=restart)
     print_first_step("reading the scene", quiet=quiet or as_json)
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarscenario.occupancy.layouts import LAYOUTS
+    from lidarscenario.occupancy.writing import OccupancySettings, write_occupancy
     from lidarsim.simulator.occupancy import VoxelGrid
 
-    from ..occupancy.layouts import LAYOUTS
-    from ..occupancy.writing import OccupancySettings, write_occupancy
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 

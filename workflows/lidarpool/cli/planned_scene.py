@@ -12,10 +12,10 @@ from lidarsim.schema.vocabulary import ALWAYS_COLUMNS
 from lidarsim.words import join_names
 
 if TYPE_CHECKING:
+    from lidarscenario.prepare import PreparedScenario
+    from lidarscenario.scenario import Scenario
     from lidarsim.media.materials import Material
 
-    from ..scenario.prepare import PreparedScenario
-    from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
 # Sections of a scenario that a plan replaces.
@@ -33,9 +33,9 @@ def prepared_with_notes(
     Notes about default poses are omitted. Returns the prepared scenario with the notes and
     warnings.
     """
-    from ..scenario.advice import advice
-    from ..scenario.default_poses import SensorPlacement
-    from ..scenario.prepare import prepare
+    from lidarscenario.advice import advice
+    from lidarscenario.default_poses import SensorPlacement
+    from lidarscenario.prepare import prepare
 
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario, plans=False)
@@ -90,7 +90,7 @@ def planned_columns(formats: Sequence[str], materials: Iterable[Material] = ()) 
 
 def sensor_entry(model: str, folder: Path) -> str:
     """Return a sensor model, or the path of its file relative to the folder of a scenario."""
-    from ..scenario.scenario import relative_file
+    from lidarscenario.scenario import relative_file
 
     is_file = model.endswith((".yaml", ".yml"))
     return relative_file(Path(model), folder) if is_file else model

@@ -15,13 +15,18 @@ import click
 
 from lidarfiles.clouds.folder import local_result, output_destination, result_folder
 from lidarfiles.datasets.job_table import Tally, read_table
+from lidarscenario.advice import advice
+from lidarscenario.job import Job
+from lidarscenario.plausibility import plausibility_warnings
+from lidarscenario.prepare import PreparedScenario, prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.shard import Shard, describe_shard
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.table import NO_SURFACE
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.words import format_scan_counts, plural
 
-from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
 from ..report.output import SurveyOutput, run_survey
@@ -32,16 +37,11 @@ from ..run.options import RunOptions
 from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
-from ..scenario.advice import advice
-from ..scenario.job import Job
-from ..scenario.plausibility import plausibility_warnings
-from ..scenario.prepare import PreparedScenario, prepare
-from ..scenario.scenario import Scenario
 from .shared_options import print_results
 from .terminal import Terminal
 
 if TYPE_CHECKING:
-    from ..scenario.campaign import CampaignSpec
+    from lidarscenario.campaign.campaign import CampaignSpec
 
 
 def run_scenario(

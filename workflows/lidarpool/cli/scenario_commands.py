@@ -57,10 +57,10 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
       lidarpool init surveys/hall --mesh hall.stl --unit mm --sensor ouster/os1-64
       lidarpool init every --all
     """  # noqa: D301 - Click requires the character \b
-    from ..scenario.advice import advice
-    from ..scenario.prepare import prepare
-    from ..scenario.scenario import Scenario, mesh_data
-    from ..scenario.schema import (
+    from lidarscenario.advice import advice
+    from lidarscenario.prepare import prepare
+    from lidarscenario.scenario import Scenario, mesh_data
+    from lidarscenario.schema import (
         SCENARIO_FILE,
         SCHEMA_FILE,
         scenario_schema,
@@ -137,16 +137,16 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import mid360.csv
       lidarpool import scanners_tls.xml#vlp16
     """  # noqa: D301 - Click requires the character \b
+    from lidarscenario.points.point_scene import surfel_mesh
+    from lidarscenario.prepare import prepare
+    from lidarscenario.scenario import Scenario
+    from lidarscenario.sections import SensorSection
     from lidarscenes.files.formats import WORLDS
     from lidarscenes.gazebo.import_world import import_world
     from lidarscenes.helios import import_scanner, import_survey, is_scanner
     from lidarscenes.mujoco.import_model import import_model
     from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
-    from ..scenario.point_scene import surfel_mesh
-    from ..scenario.prepare import prepare
-    from ..scenario.scenario import Scenario
-    from ..scenario.sections import SensorSection
     from .import_plugins import (
         SCENARIO_FILE,
         find_importer,
@@ -321,7 +321,7 @@ def schema(campaign: bool, vehicle: bool) -> None:
       lidarpool schema --campaign > campaign.schema.json
       lidarpool schema --vehicle > vehicle.schema.json
     """  # noqa: D301 - Click requires the character \b
-    from ..scenario.schema import campaign_schema, scenario_schema, schema_text, vehicle_schema
+    from lidarscenario.schema import campaign_schema, scenario_schema, schema_text, vehicle_schema
 
     if campaign and vehicle:
         raise click.UsageError("`--campaign` and `--vehicle` cannot be combined.")
@@ -436,7 +436,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
       lidarpool scene points tile.laz place.glb --epsg 32618
       lidarpool scene points stations.e57 place.glb --color intensity
     """  # noqa: D301 - Click requires the character \b
-    from ..scenario.point_scene import points_to_scene
+    from lidarscenario.points.point_scene import points_to_scene
 
     def report(note: str) -> None:
         click.echo(f"note: {note}", err=True)

@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from lidarscenario.shard import Shard
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.schema.vocabulary import BACKENDS, UNITS_M
 
@@ -23,7 +24,6 @@ from ..connection.scheduler_address import (
     read_scheduler_file,
 )
 from ..connection.tls_files import TlsFiles
-from ..identity.shard import Shard
 from . import completion
 
 Command = Callable[..., None]

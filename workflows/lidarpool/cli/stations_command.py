@@ -30,12 +30,11 @@ from .planned_scene import (
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
+    from lidarscenario.plan.stations import StationPlan, SurveyCoverage
+    from lidarscenario.prepare import PreparedScenario
+    from lidarscenario.scenario import Scenario
     from lidarsim.numerics.arrays import Floats
     from lidarsim.sensor import Sensor
-
-    from ..plan.stations import StationPlan, SurveyCoverage
-    from ..scenario.prepare import PreparedScenario
-    from ..scenario.scenario import Scenario
 
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
@@ -169,8 +168,7 @@ def stations(
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
     print_first_step("reading the scene", quiet=settings["as_json"])
     from lidarfiles.clouds.folder import check_not_existing, result_folder
-
-    from ..scenario.scenario import Scenario
+    from lidarscenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
     if cloud is not None:
@@ -201,8 +199,8 @@ def _plan(
 ) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
     from lidarfiles.work.publishing import publishing
+    from lidarscenario.plan.stations import plan_stations, sensor_elevations
 
-    from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
     from .terminal import Terminal
 
@@ -271,10 +269,10 @@ def _show_coverage(
     The visible area is the area that can be seen from the stations of the scenario.
     """
     from lidarfiles.recordings.opening import open_recording
+    from lidarscenario.plan.stations import survey_coverage
 
     from ..comparing.compared_sweep import compared_in_world
     from ..comparing.stated_frames import StatedFrame, check_same_systems
-    from ..plan.stations import survey_coverage
     from .terminal import Terminal
 
     if scenario.poses is None:
@@ -404,7 +402,7 @@ def _unreachable_notes(
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
     """Yield notes if a plan has less coverage or fewer stations than the user requested."""
-    from ..plan.stations import MAX_STATIONS
+    from lidarscenario.plan.stations import MAX_STATIONS
 
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:

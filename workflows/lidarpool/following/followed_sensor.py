@@ -12,6 +12,7 @@ import numpy as np
 from lidarfiles.clouds.ros.layouts import MessageLayout
 from lidarfiles.clouds.ros.messages import RosMessage, SurveyMessages, static_frame
 from lidarfiles.clouds.writing import ExportSpec, with_format_columns
+from lidarscenario.sensors_file import SensorOnFrame
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import quaternions_of
@@ -23,8 +24,6 @@ from lidarsim.worlds.frame_tree import FrameTree
 from lidarsim.worlds.world import WORLD, World, WorldBody, WorldFrame
 from lidarsim.worlds.world_follower import knots_ns, unseen_by
 from lidarsim.worlds.world_scanner import WorldScanner
-
-from ..scenario.sensors_file import SensorOnFrame
 
 _MAX_SPANS = 8  # spans that are kept
 _MIN_SPAN_S = 1e-6  # a sensor that fires all rays at once has no duration

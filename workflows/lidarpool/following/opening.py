@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from lidarfiles.clouds.frame_names import frame_names
 from lidarfiles.clouds.writing import ExportSpec
+from lidarscenario.sensors_file import SensorOnFrame, SensorsFile
 from lidarsim.errors import LidarError
 
-from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 from .followed_sensor import FollowedSensor
 from .node import FollowNode, FollowOptions, MessageSink, MessageSource
 from .world_files import FollowedWorld, ModelFolder, load_followed_world

@@ -9,6 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarscenario.prepare import prepare_actors
+from lidarscenario.scenario import Scenario
+from lidarscenario.sensors_file import SensorsFile
+from lidarscenario.static_scene import read_static_scene
 from lidarscenes.files.formats import ROBOTS
 from lidarscenes.robots.robot import Robot
 from lidarscenes.robots.robot_world import world_of_robot
@@ -19,11 +23,6 @@ from lidarsim.scene.files.mesh_formats import endings
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.transform import affine
 from lidarsim.worlds.world import WORLD, World, WorldBody, WorldFrame
-
-from ..scenario.prepare import prepare_actors
-from ..scenario.scenario import Scenario
-from ..scenario.sensors_file import SensorsFile
-from ..scenario.static_scene import read_static_scene
 
 _SCENARIOS = (".yaml", ".yml")
 _MODEL_FILE = "model.sdf"

@@ -13,6 +13,7 @@ import numpy as np
 
 from lidarfiles.parts.parts import read_part
 from lidarfiles.picture_file import PictureContent
+from lidarscenario.plan import best
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.errors import LidarError
@@ -21,7 +22,6 @@ from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import Answer
 from lidarview.viewer.view import View
 
-from ..plan import best
 from ..report.picture_content import planning_picture
 from ..run.pipeline.stage_messages import Receipt, ScanFrame
 from ..run.run_result import RunResult

@@ -11,6 +11,12 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.picture_file import PictureContent
+from lidarscenario.advice import advice
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.job import Job
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, SCAN, TABLE
 from lidarsim.errors import LidarError
@@ -20,12 +26,6 @@ from lidarview.viewer.point_selection import ScanOrderedPoints
 from lidarview.viewer.view import View
 
 from ..report.picture_content import planning_picture
-from ..scenario.advice import advice
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_file import is_campaign
-from ..scenario.job import Job
-from ..scenario.prepare import prepare
-from ..scenario.scenario import Scenario
 
 MATERIAL = TABLE["material"]
 _PREVIEW = "This preview was simulated before the run and shows the first sweep of each sensor."

@@ -30,11 +30,11 @@ from lidarfiles.clouds.shown_sweeps import (
 )
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.parts.parts import read_part
+from lidarscenario.plan import best
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarview.viewer.result_views import wait_for_interrupt
 
-from ..plan import best
 from ..run.pipeline.stage_messages import Receipt, ScanFrame
 from ..run.progress import Progress
 from ..run.run_page import RunPage

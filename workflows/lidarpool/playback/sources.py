@@ -19,6 +19,13 @@ from lidarfiles.clouds.folder import local_result
 from lidarfiles.clouds.navigation_files import write_instruments
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.picture_file import PICTURE_FILE, PictureContent
+from lidarscenario.advice import advice
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_file import is_campaign
+from lidarscenario.job import Job
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.sections import OutputSection
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import AXES, SCAN
@@ -30,13 +37,6 @@ from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
-from ..scenario.advice import advice
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_file import is_campaign
-from ..scenario.job import Job
-from ..scenario.prepare import prepare
-from ..scenario.scenario import Scenario
-from ..scenario.sections import OutputSection
 from .schedule import casting_threads
 
 CLOUD = "cloud.ply"

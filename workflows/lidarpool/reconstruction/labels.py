@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarscenario.points.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..scenario.point_scene import CLASS_MATERIAL, surfel_faces
 from .porosity import Porosity
 
 OBJECT_NAME = "object "  # followed by the object number in the recording

@@ -15,15 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarscenario.points.point_files import POINT_BYTES
+from lidarscenario.points.point_scene import PointVoxels, surfel_faces, surfel_materials
 from lidarsim.errors import LidarError
 from lidarsim.io.allowance import bytes_of, memory
 from lidarsim.numerics.arrays import AnyFloats, Bools, Floats, Ints
 from lidarsim.scene.colors import join_colors
 from lidarsim.scene.face_materials import join_materials
 from lidarsim.scene.scene_mesh import SceneMesh
-
-from ..scenario.point_files import POINT_BYTES
-from ..scenario.point_scene import PointVoxels, surfel_faces, surfel_materials
 
 _NEIGHBORS = (12, 32, 80)  # numbers of neighbors, increased until they are not on a line
 _MIN_WIDTH = 0.1  # minimum ratio of the variances within a plane, below which it is a line

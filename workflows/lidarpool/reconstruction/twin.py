@@ -14,6 +14,7 @@ import yaml
 
 from lidarfiles.clouds.folder import result_folder
 from lidarfiles.work.publishing import publishing
+from lidarscenario.points.point_scene import CLASS_MATERIAL
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.errors import explain_os_errors
@@ -24,7 +25,6 @@ from lidarsim.sensor.models import SensorModel
 from lidarview.page_templates import render_template
 
 from ..comparing import lidar4d
-from ..scenario.point_scene import CLASS_MATERIAL
 from .labels import SurfelMaterial
 from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, class_names

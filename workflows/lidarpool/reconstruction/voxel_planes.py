@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from lidarscenario.points.point_scene import PointVoxels
 from lidarsim.numerics.arrays import Bools, Floats, Ints
-
-from ..scenario.point_scene import PointVoxels
 
 _NEIGHBORS = 12
 _MAX_FLAT = 0.1  # maximum variance along the normal relative to the smaller variance in the plane

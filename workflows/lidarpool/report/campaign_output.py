@@ -25,12 +25,15 @@ from lidarfiles.datasets.loader import read_index, sweeps
 from lidarfiles.identity.field_words import describe_changes
 from lidarfiles.identity.sealed import seal_json, unseal_json
 from lidarfiles.identity.versions import software
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_jobs import file_hashes
+from lidarscenario.empty_cloud import empty_cloud_reason, empty_jobs_warning
+from lidarscenario.shard import ALL, Shard, describe_shard
 from lidarsim.errors import LidarError, explain_os_errors, message_of
 from lidarsim.io.storage import Storage
 from lidarsim.words import list_names, plural
 
 from ..identity.job_errors import summarize_errors
-from ..identity.shard import ALL, Shard, describe_shard
 from ..identity.software import describe_difference
 from ..run.cluster.cluster import ClusterConnection
 from ..run.committed import CommittedRun
@@ -42,9 +45,6 @@ from ..run.run_result import CampaignRun
 from ..run.runner import cast, open_store
 from ..run.store.database import FILE
 from ..run.store.run_store import RUN_FOLDER, RunStore, remove_run
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_jobs import file_hashes
-from ..scenario.empty_cloud import empty_cloud_reason, empty_jobs_warning
 
 CAMPAIGN_FILE = "campaign.json"  # campaign and software that produced the data set
 # Required entries of CAMPAIGN_FILE and their types.

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarscenario.plan.flight_density import Squares
 from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.table import Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
-from ..plan.flight_density import Squares
 from .count_loops import SHIFT, count_cells, count_labels
 
 _SQUARES = 1024  # maximum grid size along each axis, a power of two

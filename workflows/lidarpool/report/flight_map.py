@@ -10,14 +10,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from lidarscenario.plan.flight import FlightPlan
+from lidarscenario.plan.flight_density import DensityMap
+from lidarscenario.plan.flight_lines import FlightLine
 from lidarsim.numerics.arrays import Floats
 from lidarsim.words import format_rounded
 from lidarview.render import theme
 from lidarview.render.picture_page import FONT, Page
-
-from ..plan.flight import FlightPlan
-from ..plan.flight_density import DensityMap
-from ..plan.flight_lines import FlightLine
 
 SIZE = (1600, 1000)
 _FRAME = (0.075, 0.10, 0.755, 0.735)  # left, bottom, width and height of the map

@@ -20,13 +20,16 @@ from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.identity.versions import software
 from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarfiles.parts.parts import part_name
+from lidarscenario.empty_cloud import NO_POINTS, empty_jobs_warning
+from lidarscenario.plan import Trial
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.shard import ALL, Shard
 from lidarsim.errors import LidarError, MissingFileError, Mistakes, as_sentence, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_list, check_type
 from lidarsim.words import list_names
 
-from ..identity.shard import ALL, Shard
-from ..plan import Trial
 from ..run.committed import CommittedRun
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
@@ -38,9 +41,6 @@ from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
 from ..run.store.run_store import RUN_FOLDER, RunStore, add_sensors, parts_of, remove_run
-from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
-from ..scenario.prepare import prepare
-from ..scenario.scenario import Scenario
 from .campaign_output import (
     CAMPAIGN_FILE,
     list_dataset_files,

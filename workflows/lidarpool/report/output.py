@@ -21,6 +21,7 @@ from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarfiles.parts.parts import StoredCloud
 from lidarfiles.picture_file import PICTURE_FILE
 from lidarfiles.work.publishing import move_into_place
+from lidarscenario.scenario import Scenario
 from lidarsim.columns.table import optional_columns
 from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage, staging
@@ -39,7 +40,6 @@ from ..run.run_result import RunResult
 from ..run.runner import cast, open_store
 from ..run.store.run_store import RunStore
 from ..run.writer import LidarWorkers
-from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
 from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from lidarfiles.picture_file import PictureContent, PlannedPath, PlanningPicture
+from lidarscenario.plan import Plan, Planning, Trial
 
-from ..plan import Plan, Planning, Trial
 from ..run.run_result import RunResult
 
 

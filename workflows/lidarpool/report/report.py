@@ -14,6 +14,14 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.flight_lines import summarize_flight_lines
+from lidarscenario.plan.flight_density import (
+    DensityMap,
+    cell_side_m,
+    longest_side_m,
+    summarize_density,
+)
+from lidarscenario.plan.planning import Search
+from lidarscenario.scenario import Scenario
 from lidarsim._version import __version__
 from lidarsim.columns.table import NO_SURFACE
 from lidarsim.io.storage import Storage
@@ -23,13 +31,10 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
-from ..plan.flight_density import DensityMap, cell_side_m, longest_side_m, summarize_density
-from ..plan.planning import Search
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
 from ..run.planning_trials import TRIAL
 from ..run.run_result import RunResult
-from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
 
 ELEVATION_RAYS = 20_000  # number of rays from which the elevation range is computed

@@ -20,6 +20,7 @@ from matplotlib.patheffects import withStroke
 from lidarfiles.clouds.folder import result_folder
 from lidarfiles.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarfiles.work.publishing import move_into_place
+from lidarscenario.plan.stations import StationPlan, StationVisibility
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
@@ -37,7 +38,6 @@ from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_sc
 from lidarview.render.shot import SIZE, RaySamples, SurfaceView, take_shot
 from lidarview.render.surface import normalize
 
-from ..plan.stations import StationPlan, StationVisibility
 from .page.rendering import insert_picture
 from .result_files import PAGE
 

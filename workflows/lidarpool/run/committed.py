@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..identity.shard import ALL
-from ..plan import best
-from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
+from lidarscenario.empty_cloud import EMPTY, empty_cloud_reason
+from lidarscenario.plan import best
+from lidarscenario.shard import ALL
+
 from .pipeline.task_book import StageTotals
 from .progress import Screen
 from .run_result import RunResult

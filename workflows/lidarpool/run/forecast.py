@@ -16,6 +16,8 @@ from distributed.system import MEMORY_LIMIT
 
 from lidarfiles.clouds.flight_lines import firing_span_s, flight_lines, summarize_flight_lines
 from lidarfiles.clouds.navigation_files import instrument_bytes
+from lidarscenario.empty_cloud import EMPTY, empty_cloud_reason
+from lidarscenario.job import Job
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.casting.visibility import unseen_objects
 from lidarsim.columns.cloud import CHUNK_POINTS
@@ -39,8 +41,6 @@ from lidarsim.words import join_names
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
-from ..scenario.job import Job
 from .cluster.requirements import check_memory, default_workers, slots_needed
 from .options import RunOptions
 from .pipeline.policies import max_scans_per_batch

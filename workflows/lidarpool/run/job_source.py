@@ -16,6 +16,10 @@ import numpy as np
 from lidarfiles.datasets.job_table import JobRow, Value
 from lidarfiles.identity.field_words import describe_fields
 from lidarfiles.identity.fingerprint import fingerprint
+from lidarscenario.job import Job
+from lidarscenario.plan import Planning
+from lidarscenario.shard import ALL, Shard
+from lidarscenario.static_scene import SceneCache
 from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
@@ -23,14 +27,10 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
-from ..identity.shard import ALL, Shard
-from ..plan import Planning
-from ..scenario.job import Job
-from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
 
 if TYPE_CHECKING:
-    from ..scenario.campaign import CampaignSpec
+    from lidarscenario.campaign.campaign import CampaignSpec
 
 MAX_READY = 16  # jobs that are created in advance, because small jobs are cast together
 MAX_SCENES = 2  # maximum number of scenes in the jobs that are created in advance

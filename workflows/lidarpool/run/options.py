@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from pydantic import Field
 
+from lidarscenario.sections import PoolSection, TaskOptions
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_fields, check_type
@@ -19,7 +20,6 @@ from lidarsim.schema.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
 from lidarsim.words import did_you_mean
 
 from ..connection.tls_files import TlsFiles
-from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .store.database import FILE
 

@@ -7,9 +7,9 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 
+from lidarscenario.plan import Planning, Trial, run_trial
 from poolpart.task_locations import PartitionSnapshot
 
-from ..plan import Planning, Trial, run_trial
 from .cluster.tasks import TaskGroup
 from .pipeline.failures import raise_if_failed, was_killed
 from .pipeline.task_records import call_recorded

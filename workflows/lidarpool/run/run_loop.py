@@ -17,13 +17,13 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 from lidarfiles.datasets.job_table import JobRow
+from lidarscenario.job import Job
+from lidarscenario.plan import Planning, Trial
 from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.words import list_names, plural
 
-from ..plan import Planning, Trial
 from ..processes import timeline
-from ..scenario.job import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
 from .committed import CommittedRun

@@ -9,13 +9,13 @@ from typing import Any
 
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.parts.parts import StoredCloud
+from lidarscenario.plan import Plan, Planning, Trial
 from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 
-from ..plan import Plan, Planning, Trial
 from .job_source import describe_inputs
 from .pipeline.task_book import StageTotals
 from .pipeline.task_records import TaskRecord

@@ -11,8 +11,8 @@ from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from lidarfiles.datasets.job_table import JobRow
+from lidarscenario.job import Job
 
-from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
 from .committed import CommittedRun
 from .job_source import JobProducer, Jobs

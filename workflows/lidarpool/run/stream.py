@@ -24,6 +24,10 @@ from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.kitti import kitti_intensity
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.datasets.sweep_data import sweep_of_job
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.campaign.campaign_sections import DatasetFormat
+from lidarscenario.empty_cloud import empty_cloud_reason
+from lidarscenario.job import Job
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -36,10 +40,6 @@ from lidarsim.simulator.memory import MB, scans_that_fit
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import DatasetFormat
-from ..scenario.empty_cloud import empty_cloud_reason
-from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
 from .cluster.cluster import open_client
 from .cluster.watch import WaitTimer, Watch

@@ -11,6 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenario.sections import OutputSection, SensorSection
+from lidarscenario.sensors_file import SensorOnFrame, SensorsFile
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.io.input_files import read_input
@@ -25,10 +29,6 @@ from lidarsim.words import format_rounded, name_hint, printable
 
 from ..reconstruction.recorded_actors import FOLDER as ACTORS_FOLDER
 from ..reconstruction.twin import FIGURES_FILE, SCENARIO_FILE
-from ..scenario.prepare import prepare
-from ..scenario.scenario import Scenario
-from ..scenario.sections import OutputSection, SensorSection
-from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 
 # Maximum relative difference between the durations of a frame and of a sweep. The rotation rate of
 # a real sensor also varies.

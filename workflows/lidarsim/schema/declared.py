@@ -3,7 +3,7 @@
 A setting is a dataclass field that is declared as
 `Annotated[type, about(description, limits)] = default`. The dataclass validates the limits with
 `lidarsim.schema.checks.check_fields`. A dataclass that derives from `FileSection` is a section in
-scenario files. Other sections inherit its fields (`lidarpool.scenario.sections`).
+scenario files. Other sections inherit its fields (`lidarscenario.sections`).
 """
 
 from __future__ import annotations

@@ -20,6 +20,8 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from lidarscenario.plan.flight_density import Squares
+from lidarscenario.scenario import Scenario
 from lidarsim.errors import explain_os_errors
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Floats, Ints
@@ -30,11 +32,9 @@ from lidarsim.words import natural_sort_key, plural
 from lidarview.page_templates import duration, format_value, render_template
 from lidarview.render.stage import nice_step
 
-from ...plan.flight_density import Squares
 from ...run.pipeline.task_book import StageTotals, union
 from ...run.pipeline.task_records import TaskRecord
 from ...run.run_result import RunResult
-from ...scenario.scenario import Scenario
 from ..cloud_counts import CloudCounts
 from ..report import STAGES, sort_stages
 

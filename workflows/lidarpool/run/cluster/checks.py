@@ -14,6 +14,8 @@ from distributed import Client
 
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.identity.versions import software
+from lidarscenario.job import Job
+from lidarscenario.sections import TaskOptions
 from lidarsim._version import __version__
 from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError
@@ -23,8 +25,6 @@ from poolpart.workers import run_on_workers, worker_identities
 from raybeam import available_backends
 
 from ...identity.software import describe_difference, software_query
-from ...scenario.job import Job
-from ...scenario.sections import TaskOptions
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from .requirements import check_memory
 from .watch import WaitTimer, queued_clause

@@ -10,13 +10,13 @@ from distributed import Client, get_worker
 from distributed.comm.core import CommClosedError
 
 from lidarfiles.work.cluster_map import CLUSTER_LOST, is_connection_lost
+from lidarscenario.job import Job
 from lidarsim.casting.scene_caster import check_backend_here
 from lidarsim.errors import LidarError
 from poolpart import Partition, PoolError
 from poolpart.task_context import own_client
 
 from ...processes import timeline
-from ...scenario.job import Job
 from ..job_source import Jobs
 from ..options import RunOptions
 from ..pipeline.stage_names import GPU, LIDAR, OTHER

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from functools import partial
 
+from lidarscenario.job import Job
+from lidarscenario.sections import TaskOptions
 from lidarsim.simulator.memory import MB, cast_bytes
 
-from ...scenario.job import Job
-from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 

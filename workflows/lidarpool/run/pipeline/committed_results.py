@@ -8,9 +8,9 @@ from operator import attrgetter
 
 import numpy as np
 
+from lidarscenario.plan import Trial
 from lidarsim.numerics.arrays import Ints
 
-from ...plan import Trial
 from .stage_messages import Receipt
 
 _FIRST = attrgetter("first")  # sort key of parts

@@ -20,8 +20,8 @@ import tornado.platform.asyncio  # noqa: F401
 import poolpart.deploy.local  # noqa: F401
 from lidarfiles.identity import versions
 from lidarfiles.processes.freed_memory import keep_freed_memory
+from lidarscenario.plan import trial  # noqa: F401
 
-from ...plan import trial  # noqa: F401
 from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()

@@ -22,9 +22,9 @@ import numpy as np
 
 from lidarfiles.datasets.job_table import MAX_JOBS
 from lidarfiles.parts.parts import part_name
+from lidarscenario.plan import Trial
 from lidarsim.errors import LidarError
 
-from ...plan import Trial
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.stage_messages import Receipt
 

@@ -19,14 +19,14 @@ from lidarfiles.identity.field_words import describe_changes
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.identity.versions import software
 from lidarfiles.parts.parts import deletable_files, mark_name, parse_part_name
+from lidarscenario.job import Job
+from lidarscenario.shard import ALL, describe_shard
 from lidarsim.casting.scene_caster import AUTO_ADVICE
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.words import format_rounded
 
-from ...identity.shard import ALL, describe_shard
-from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.failures import convert_storage_errors

@@ -10,14 +10,14 @@ from functools import partial
 import numpy as np
 
 from lidarfiles.parts.parts import StoredCloud, read_actor_rays, read_hit_counts, read_part, unpack
+from lidarscenario.job import Job
+from lidarscenario.plan import Trial
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...plan import Trial
-from ...scenario.job import Job
 from ..pipeline.committed_results import CommittedParts, CommittedResults
 from ..pipeline.stage_messages import (
     SAMPLES_PER_SURVEY,

@@ -17,7 +17,7 @@ from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.random_numbers import named_seed
 
-from ..scenario.mount_sections import MountRanges, VehicleFile
+from ..mount_sections import MountRanges, VehicleFile
 from .evaluation import MountResult
 from .placements import Placements
 from .ranking import CandidateResult, MountCandidate, RankingRules, evaluate_candidate

@@ -41,7 +41,6 @@ from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import animate_wheels
 from lidarsim.words import join_names, plural
 
-from .ground import SupportSurfaces
 from .scenario import Scenario
 from .sections import (
     MAX_COPIES,
@@ -54,6 +53,7 @@ from .sections import (
     ShapeSection,
     file_states,
 )
+from .traffic.ground import SupportSurfaces
 
 # Fields of a `MeshFile` that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}

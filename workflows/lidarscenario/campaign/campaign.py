@@ -25,14 +25,14 @@ from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.checks import check_list, check_number
 from lidarsim.schema.error_sentences import convert_validation_errors
 
-from ..identity.shard import ALL, Shard
+from ..job import Job
+from ..prepare import PreparedScenario
+from ..scenario import Scenario
+from ..sections import PoolSection
+from ..shard import ALL, Shard
+from ..static_scene import SceneCache
 from .campaign_jobs import FunctionJobs, JobSource, SampledJobs, ScenarioJobs
 from .campaign_sections import MAX_JOBS, CampaignSection, DatasetFormat, Splits
-from .job import Job
-from .prepare import PreparedScenario
-from .scenario import Scenario
-from .sections import PoolSection
-from .static_scene import SceneCache
 
 _FORM = "a campaign file contains base:, count:, vary:, keep: and splits:"
 MAX_SHOWN_FILES = 5  # maximum number of file names in the recorded command

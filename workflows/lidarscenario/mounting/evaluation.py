@@ -111,8 +111,8 @@ class MountEvaluator:
         Examples
         --------
         >>> from lidarpool import Pose, load_sensor
-        >>> from lidarpool.mounting.study import MountStudy
-        >>> from lidarpool.scenario.mount_sections import VehicleFile
+        >>> from lidarscenario.mounting.study import MountStudy
+        >>> from lidarscenario.mount_sections import VehicleFile
         >>> vehicle = VehicleFile.from_data({
         ...     "body": "saloon",
         ...     "sensors": {"top": {"model": "velodyne/vlp16", "mounts": [0, 0, 1.8]}},

@@ -24,7 +24,7 @@ from lidarsim.schema.declared import declared_values
 from lidarsim.words import printable
 from lidarview.page_templates import render_template
 
-from ..scenario.mount_sections import VehicleFile
+from ..mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .study import MountRanking, MountStudy, figures_of, pose_entry
 

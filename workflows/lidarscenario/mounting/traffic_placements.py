@@ -14,9 +14,9 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.vectors import matmul, matvec
 from lidarsim.scene.actors import Actor
 
-from ..scenario.mount_sections import TargetSection, TrafficTargets, VehicleFile
-from ..scenario.prepare import PreparedScenario, prepare
-from ..scenario.scenario import Scenario
+from ..mount_sections import TargetSection, TrafficTargets, VehicleFile
+from ..prepare import PreparedScenario, prepare
+from ..scenario import Scenario
 from .placements import Placements, Target
 
 _ALL = "actor"  # name of the only class if no classes are given

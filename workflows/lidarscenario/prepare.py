@@ -38,19 +38,19 @@ from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.words import name_hint, plural
 
-from ..plan import Planning
-from ..plan.planning import Search
-from .actor_motion import ActorSection, MountSection
 from .default_poses import SensorPlacement, place_sensor
 from .georeference import check_epsg
-from .ground import SupportSurfaces
 from .job import Job
-from .osi_trace import OSI_SUFFIXES
-from .osi_traffic import read_osi
+from .plan import Planning
+from .plan.planning import Search
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
 from .static_scene import FileFindings, SceneCache, ShapeLoader, StaticScene, read_static_scene
-from .traffic import (
+from .traffic.actor_motion import ActorSection, MountSection
+from .traffic.ground import SupportSurfaces
+from .traffic.osi_trace import OSI_SUFFIXES
+from .traffic.osi_traffic import read_osi
+from .traffic.traffic import (
     TrafficContent,
     TrafficSection,
     TravelerFilter,

@@ -22,11 +22,11 @@ from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGrid
 from lidarsim.words import join_names
 
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_file import is_campaign
-from ..scenario.job import Job
-from ..scenario.prepare import prepare
-from ..scenario.scenario import Scenario
+from ..campaign.campaign import CampaignSpec
+from ..campaign.campaign_file import is_campaign
+from ..job import Job
+from ..prepare import prepare
+from ..scenario import Scenario
 from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:

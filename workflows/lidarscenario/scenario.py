@@ -30,7 +30,6 @@ from lidarsim.sensor.models import MODEL_FILES, plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
-from .actor_motion import ActorSection, MountedSensorEntry, MountEntry, TrajectoryEntry
 from .sections import (
     CopiesSection,
     FlightSection,
@@ -47,7 +46,8 @@ from .sections import (
     allow_empty,
     allow_scene_short_form,
 )
-from .traffic import TrafficSection
+from .traffic.actor_motion import ActorSection, MountedSensorEntry, MountEntry, TrajectoryEntry
+from .traffic.traffic import TrafficSection
 
 _FILE_FIELDS = {"file", "calibration", "model", "times"}  # fields that contain file names
 _PATH_FIELDS = _FILE_FIELDS | {"assets"}  # fields that contain names of files or folders
@@ -131,13 +131,13 @@ class Scenario(Section):
     """A survey with optional path planning, as described by a scenario file.
 
     A scenario that is created without arguments has no scene and cannot be simulated. See
-    `lidarpool.scenario.demo` for the scenario of the demo.
+    `lidarscenario.demo` for the scenario of the demo.
 
     Parameters
     ----------
     scene, world, sensor, materials, returns, noise, weather, navigation, flight, faults, cloud, \
     output, planning, pool
-        See `lidarpool.scenario.sections`.
+        See `lidarscenario.sections`.
     poses
         Poses of the sensor, in the coordinates of the scene. In the scene of the demo, the default
         is 1, 2 and 3 m above the origin. In other scenes, `place_sensor` chooses poses at the

@@ -13,7 +13,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonRef
 
 from lidarsim.schema.section_fields import fields_of, is_section, kinds_of
 
-from .campaign_sections import CampaignSection
+from .campaign.campaign_sections import CampaignSection
 from .default_poses import as_yaml_line
 from .mount_sections import VehicleFile
 from .scenario import Scenario

@@ -18,10 +18,10 @@ from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.sensor import Noise, Returns
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, Mounted
 
-from .actor_motion import MountedSensorEntry, MountEntry
 from .prepare import MESH_PRECISION_M
 from .scenario import Scenario
 from .sections import NoiseSection, ReturnsSection, Section, SensorSection, allow_empty
+from .traffic.actor_motion import MountedSensorEntry, MountEntry
 
 # Fields that describe a survey, which a program that follows another simulator does not have.
 _SURVEY_FIELDS = {"steps"}

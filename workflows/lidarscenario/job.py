@@ -24,8 +24,8 @@ from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..plan import Planning
 from .georeference import check_epsg, location_warning
+from .plan import Planning
 
 _log = logging.getLogger(__name__)
 

@@ -60,7 +60,7 @@ from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 from lidarsim.survey.survey import EpsgCode, Mounted
 
-from ..plan.planning import Search
+from .plan.planning import Search
 
 MAX_COPIES = 1_000_000  # maximum number of copies of an entry
 ResolvePath = Callable[[str], Path]  # returns the path of a file that is named in a scenario

@@ -34,20 +34,14 @@ from lidarsim.schema.section_fields import format_path
 from lidarsim.schema.value_texts import format_value
 from lidarsim.words import plural
 
+from ..field_paths import FieldSteps, find_field, replace_value
+from ..job import Job
+from ..prepare import PreparedScenario, prepare
+from ..scenario import Scenario
+from ..sections import file_states
+from ..static_scene import SceneCache
 from .campaign_file import is_campaign
-from .campaign_sections import (
-    MAX_JOBS,
-    CampaignSection,
-    JobRandom,
-    ValueRule,
-    read_rows,
-)
-from .field_paths import FieldSteps, find_field, replace_value
-from .job import Job
-from .prepare import PreparedScenario, prepare
-from .scenario import Scenario
-from .sections import file_states
-from .static_scene import SceneCache
+from .campaign_sections import MAX_JOBS, CampaignSection, JobRandom, ValueRule, read_rows
 
 _NOISE_SEED = "noise.seed"  # path of the seed that differs between jobs
 # Maximum number of scenarios whose fields are stored with a run. If the run is resumed with changed

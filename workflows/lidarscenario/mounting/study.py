@@ -25,9 +25,9 @@ from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
 from raybeam import RayCaster
 
-from ..scenario.mount_sections import MAX_CELLS, BodyPart, VehicleFile
-from ..scenario.sections import ShapeSection
-from ..scenario.static_scene import FileFindings, ShapeLoader
+from ..mount_sections import MAX_CELLS, BodyPart, VehicleFile
+from ..sections import ShapeSection
+from ..static_scene import FileFindings, ShapeLoader
 from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements

@@ -58,7 +58,7 @@ from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
 from lidarsim.words import did_you_mean_each, format_yaml_list, join_names, printable
 
-from .sections import IgnoredColumns, Section, allow_empty
+from ..sections import IgnoredColumns, Section, allow_empty
 
 # Normally distributed numbers are limited to this many standard deviations from the mean. Numbers
 # outside the limit, 2 in a billion, are drawn again.

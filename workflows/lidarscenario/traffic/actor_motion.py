@@ -35,8 +35,7 @@ from lidarsim.schema.declared import (
 )
 from lidarsim.survey.survey import Mounted, StepCount
 
-from .ground import SupportSurfaces, follow_surfaces
-from .sections import (
+from ..sections import (
     DeformingSection,
     IgnoredColumns,
     MeshEntry,
@@ -49,6 +48,7 @@ from .sections import (
     SensorSection,
     by_position,
 )
+from .ground import SupportSurfaces, follow_surfaces
 
 _READING_OPTIONS = {
     "format", "time_unit", "columns", "ignore", "topic", "origin", "camera_axes", "offset_s",

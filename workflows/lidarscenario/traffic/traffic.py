@@ -34,9 +34,9 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.declared import Several, Text, TextOrTexts, Triple, about
 from lidarsim.words import format_yaml_list, matches_pattern, name_hint, plural, printable
 
+from ..sections import DeformingSection, Section
 from .actor_motion import TimeUnitEntry, TrajectorySection
 from .ground import SupportSurfaces, follow_surfaces
-from .sections import DeformingSection, Section
 
 HOST = "host"  # alias for the ID of the host vehicle in an OSI trace
 

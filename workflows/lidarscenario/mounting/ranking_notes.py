@@ -12,7 +12,7 @@ from lidarsim.sensor.models import read_model
 from lidarsim.words import join_names, list_names, plural
 from raybeam import RayCaster
 
-from ..scenario.mount_sections import DEFAULT_HEIGHT_M, VehicleFile
+from ..mount_sections import DEFAULT_HEIGHT_M, VehicleFile
 from .evaluation import MountResult
 from .placements import Placements
 from .ranking import CandidateResult

@@ -1,0 +1,1 @@
+"""Campaign files, and the jobs that are created from them."""

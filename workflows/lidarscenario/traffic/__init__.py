@@ -1,0 +1,1 @@
+"""Actors of a scenario, and how they move."""
