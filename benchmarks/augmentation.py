@@ -25,9 +25,9 @@ import numpy as np
 
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Noise, Sensor, Sweep, save_cloud
-from lidarpool.augmentation.augmented_sweep import AugmentedSweep
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects, Insertion
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import box

@@ -26,7 +26,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.augmentation.effects import Effects
+from lidarreal.augmentation.effects import Effects
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, CAUSES, SCAN

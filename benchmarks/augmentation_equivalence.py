@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import ks_2samp
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.augmenter import Augmenter
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 

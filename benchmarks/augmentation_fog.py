@@ -17,9 +17,9 @@ from scipy.stats import ks_2samp
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Sensor, load_sensor
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects
-from lidarpool.augmentation.scan_pattern import ScanPattern
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects
+from lidarreal.augmentation.scan_pattern import ScanPattern
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Floats

@@ -16,7 +16,7 @@ import numpy as np
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
-from lidarpool.comparing.fit.fitting import fit
+from lidarreal.comparing.fit.fitting import fit
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, place_instances
 from lidarsim.columns.sweep import Sweep

@@ -36,21 +36,17 @@ from PIL import Image
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool.reconstruction.alignment import AlignedSweeps, first_alignment
-from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
-from lidarpool.reconstruction.free_space import find_stationary_points
-from lidarpool.reconstruction.held_out import HeldOutRays
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.odometry import RecordedPoses
-from lidarpool.reconstruction.range_noise import RingNeighbors, estimate_range_noise
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.submap_tasks import (
-    BuildTask,
-    align_submap,
-    compare_held_out_sweeps,
-)
-from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
-from lidarpool.reconstruction.vehicle_detection import find_poses_and_vehicle
+from lidarreal.reconstruction.alignment import AlignedSweeps, first_alignment
+from lidarreal.reconstruction.building import DEFAULT_VOXEL_M
+from lidarreal.reconstruction.free_space import find_stationary_points
+from lidarreal.reconstruction.held_out import HeldOutRays
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.odometry import RecordedPoses
+from lidarreal.reconstruction.range_noise import RingNeighbors, estimate_range_noise
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.submap_tasks import BuildTask, align_submap, compare_held_out_sweeps
+from lidarreal.reconstruction.submaps import merge_alignments, split_into_submaps
+from lidarreal.reconstruction.vehicle_detection import find_poses_and_vehicle
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices

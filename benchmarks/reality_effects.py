@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarpool.reconstruction.alignment import AlignedSweeps
-from lidarpool.reconstruction.range_noise import RingNeighbors
+from lidarreal.reconstruction.alignment import AlignedSweeps
+from lidarreal.reconstruction.range_noise import RingNeighbors
 from lidarsim.numerics.arrays import Floats
 
 from .harness import argument_parser, write_results

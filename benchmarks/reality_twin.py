@@ -13,25 +13,25 @@ import numpy as np
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import Material, Pose, Returns, Scanner, Scene, Sensor, Track, load_sensor
-from lidarpool.reconstruction.alignment import AlignedSweeps, first_alignment
-from lidarpool.reconstruction.building import DEFAULT_VOXEL_M, color_by_reflectance
-from lidarpool.reconstruction.free_space import find_stationary_points
-from lidarpool.reconstruction.labels import SurfelMaterial, split_by_object
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.recorded_sensor import SweepTiming, fit_sensor
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.reflectances import IntensityModel
-from lidarpool.reconstruction.submap_tasks import (
+from lidarreal.reconstruction.alignment import AlignedSweeps, first_alignment
+from lidarreal.reconstruction.building import DEFAULT_VOXEL_M, color_by_reflectance
+from lidarreal.reconstruction.free_space import find_stationary_points
+from lidarreal.reconstruction.labels import SurfelMaterial, split_by_object
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.recorded_sensor import SweepTiming, fit_sensor
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.reflectances import IntensityModel
+from lidarreal.reconstruction.submap_tasks import (
     BuildTask,
     SubmapSurfels,
     align_submap,
     build_map_with_reflectances,
 )
-from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
-from lidarpool.reconstruction.surfels import surfel_mesh
-from lidarpool.reconstruction.twin import NO_RETURN
-from lidarpool.reconstruction.vehicle_detection import find_poses_and_vehicle
+from lidarreal.reconstruction.submaps import merge_alignments, split_into_submaps
+from lidarreal.reconstruction.surfels import surfel_mesh
+from lidarreal.reconstruction.twin import NO_RETURN
+from lidarreal.reconstruction.vehicle_detection import find_poses_and_vehicle
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Trajectory
 from lidarsim.numerics.arrays import Bools, Floats, Ints

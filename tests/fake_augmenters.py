@@ -4,8 +4,8 @@ import numpy as np
 
 from lidarfiles.clouds.boxes import SweepBoxes
 from lidarfiles.work.publishing import publishing
-from lidarpool.augmentation.augmented_sweep import AugmentedSweep
-from lidarpool.augmentation.rewriting.rewriter import EncodedSweeps
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.rewriting.rewriter import EncodedSweeps
 
 INTENSITY = 0.25  # of each added point
 NAMES = ("Inserted car 1", "walker 2")

@@ -15,9 +15,9 @@ from PIL import Image, ImageDraw
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.color_table import TURBO
 from lidarpool import Fault, Pose, Scanner, load_sensor
-from lidarpool.augmentation.augmented_sweep import AugmentedSweep
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects, Insertion
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES

@@ -15,8 +15,8 @@ from docs.pictures.options import IMAGES
 from matplotlib.colors import Normalize
 
 from lidarpool import read_cloud
-from lidarpool.comparing.surveys.strips import StripSettings, strip_deviations
-from lidarpool.comparing.surveys.survey_clouds import SurveyCloud
+from lidarreal.comparing.surveys.strips import StripSettings, strip_deviations
+from lidarreal.comparing.surveys.survey_clouds import SurveyCloud
 from lidarsim.numerics.arrays import Floats
 from lidarview.render import theme
 from lidarview.render.picture_page import Page

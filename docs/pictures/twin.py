@@ -15,7 +15,7 @@ from docs.pictures.options import file_parser
 from PIL import Image, ImageDraw
 
 from lidarpool import Actor, Mounted, Pose, Scanner, Survey, Track, load_sensor, twin
-from lidarpool.reconstruction.twin import Twin
+from lidarreal.reconstruction.twin import Twin
 from lidarscenes.procedural.city import city
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.actors import box

@@ -18,7 +18,7 @@ from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.figures import rank_correlation
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
-from lidarpool.comparing import comparison_charts, two_clouds
+from lidarreal.comparing import comparison_charts, two_clouds
 from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS = 16

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import LidarError
-from lidarpool.augmentation import running
 from lidarpool.cli.commands import cli
+from lidarreal.augmentation import running
 
 VOXELS = "sequences/00/voxels/000000.bin"
 

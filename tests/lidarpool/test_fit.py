@@ -29,11 +29,11 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarpool.comparing.fit import search
-from lidarpool.comparing.fit.estimates import Estimate
-from lidarpool.comparing.fit.fitting import _with_performance
-from lidarpool.comparing.fit.measured import SensorMeasurement
-from lidarpool.comparing.fit.smooth_surfaces import SmoothRays
+from lidarreal.comparing.fit import search
+from lidarreal.comparing.fit.estimates import Estimate
+from lidarreal.comparing.fit.fitting import _with_performance
+from lidarreal.comparing.fit.measured import SensorMeasurement
+from lidarreal.comparing.fit.smooth_surfaces import SmoothRays
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.models import read_model

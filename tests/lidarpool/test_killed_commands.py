@@ -23,16 +23,16 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 from lidarfiles.work import publishing, work
 from lidarfiles.work.work import FOLDER, Step
 from lidarpool import Cloud, save_cloud, twin
-from lidarpool.augmentation.effects import Effects
-from lidarpool.augmentation.running import Augmentation
-from lidarpool.augmentation.sweep_tasks import PartProcess, RecordingFile
-from lidarpool.augmentation.variants import CampaignVariants, Variants
-from lidarpool.comparing.comparison_files import write_comparison
-from lidarpool.comparing.fit import charts, fitting
-from lidarpool.reconstruction import building
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.report import result_pictures
 from lidarpool.report.result_pictures import publish_pictures
+from lidarreal.augmentation.effects import Effects
+from lidarreal.augmentation.running import Augmentation
+from lidarreal.augmentation.sweep_tasks import PartProcess, RecordingFile
+from lidarreal.augmentation.variants import CampaignVariants, Variants
+from lidarreal.comparing.comparison_files import write_comparison
+from lidarreal.comparing.fit import charts, fitting
+from lidarreal.reconstruction import building
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarscenario.mounting import pictures
 from lidarscenario.mounting.evaluation import MountEvaluator, MountResult
 from lidarscenario.mounting.study_files import rank_mounts

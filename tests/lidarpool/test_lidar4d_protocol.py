@@ -18,8 +18,8 @@ from click.testing import CliRunner
 from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, compare
 from lidarpool.cli.commands import cli
-from lidarpool.comparing import lidar4d
-from lidarpool.comparing.lidar4d import (
+from lidarreal.comparing import lidar4d
+from lidarreal.comparing.lidar4d import (
     WINDOWS,
     FrameCollector,
     FrameMetrics,
@@ -28,10 +28,10 @@ from lidarpool.comparing.lidar4d import (
     full_scale_of,
     structural_similarity,
 )
-from lidarpool.reconstruction.alignment import AlignedSweep
-from lidarpool.reconstruction.held_out import HeldOutRays
-from lidarpool.reconstruction.published_metrics import HeldOutFrames
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.alignment import AlignedSweep
+from lidarreal.reconstruction.held_out import HeldOutRays
+from lidarreal.reconstruction.published_metrics import HeldOutFrames
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarsim.columns.sweep import Sweep
 
 HEIGHT, WIDTH = 66, 1030
@@ -454,7 +454,7 @@ def test_a_window_is_read_from_all_frames_or_is_alone(count, first, monkeypatch,
     recording = Recording(
         "frames", count, read, read_stamps=lambda: range(count), read_poses=lambda: poses
     )
-    module = "lidarpool.reconstruction.recorded_sweeps"
+    module = "lidarreal.reconstruction.recorded_sweeps"
     monkeypatch.setattr(f"{module}.open_recording", lambda *_, **__: recording)
     recorded = RecordedSweeps.open(tmp_path / str(count), window=2350)
     assert recorded.count == 51

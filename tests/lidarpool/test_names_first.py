@@ -20,8 +20,8 @@ def unread(monkeypatch):
 
     for place in (
         "lidarscenario.prepare.read_static_scene",
-        "lidarpool.comparing.fit.fitting.as_recording",
-        "lidarpool.reconstruction.building.RecordedSweeps.open",
+        "lidarreal.comparing.fit.fitting.as_recording",
+        "lidarreal.reconstruction.building.RecordedSweeps.open",
     ):
         monkeypatch.setattr(place, read)
 

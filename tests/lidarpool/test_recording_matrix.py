@@ -22,9 +22,9 @@ from lidarpool import (
     open_recording,
     save_cloud,
 )
-from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.pages.recorded import recorded_view
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.comparing.fit.stack import SweepStack
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarscenario.points.point_files import read_points
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN

@@ -18,13 +18,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, compare, load_trajectory, twin
-from lidarpool.comparing.fit.stack import SweepStack
 from lidarpool.pages.opened import open_view
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.comparing.fit.stack import SweepStack
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import RecordedPoses, find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarsim.columns.bags import POINT_CLOUD
 from lidarsim.io.archives import pack_arrays
 from lidarsim.scene.files.pcd import pcd_bytes

@@ -28,8 +28,8 @@ from lidarpool import (
     open_recording,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.comparing.surveys import pairs, planes
-from lidarpool.comparing.surveys.survey_charts import draw_facades
+from lidarreal.comparing.surveys import pairs, planes
+from lidarreal.comparing.surveys.survey_charts import draw_facades
 from lidarsim.sweeps.sweeps import Sweeps
 
 ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])
@@ -702,7 +702,7 @@ def test_different_units_are_refused(tmp_path):
     np.savetxt(meters, points * 0.3048)
     found = compare_surveys(tmp_path / "feet.xyz", meters, unit_a="ft", method="planes", radius_m=2)
     assert abs(components(found, "distance")["mean_m"]) < 1e-6
-    from lidarpool.comparing.surveys.survey_clouds import SurveyCloud, check_same_frame
+    from lidarreal.comparing.surveys.survey_clouds import SurveyCloud, check_same_frame
 
     feet = SurveyCloud.open(tmp_path / "feet.xyz", "", unit="ft")
     feet = SurveyCloud(feet.name, feet.recordings, None)  # as if the file stated its unit
@@ -846,7 +846,7 @@ def test_options_of_another_kind_of_comparison_are_refused(arguments, says):
 @pytest.mark.parametrize("method", ["planes", "mesh"])
 def test_the_progress_continues_after_the_clouds_are_read(tmp_path, monkeypatch, method):
     """Three batches of points, and for planes as many of reference points."""
-    monkeypatch.setattr(f"lidarpool.comparing.surveys.{method}._BATCH", 300)
+    monkeypatch.setattr(f"lidarreal.comparing.surveys.{method}._BATCH", 300)
     x, y = np.meshgrid(np.arange(30.0), np.arange(30.0))
     plane = np.stack([x.ravel(), y.ravel(), np.zeros(900)], axis=1)
     b = Cloud(plane, {})

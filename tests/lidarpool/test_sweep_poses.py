@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from lidarpool import SceneMesh
-from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
-from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import RecordedPoses
-from lidarpool.reconstruction.porosity import Porosity
-from lidarpool.scan_patterns.lasers import RingLasers
+from lidarreal.comparing.fit.smooth_surfaces import find_surfaces
+from lidarreal.reconstruction.alignment import Alignment
+from lidarreal.reconstruction.free_space import RangeImage
+from lidarreal.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import RecordedPoses
+from lidarreal.reconstruction.porosity import Porosity
+from lidarreal.scan_patterns.lasers import RingLasers
 from lidarscenario.points.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials

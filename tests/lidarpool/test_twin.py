@@ -35,12 +35,12 @@ from lidarpool import (
     twin,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import find_poses
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.scan_patterns.lasers import RingLasers
+from lidarreal.reconstruction.alignment import Alignment
+from lidarreal.reconstruction.lost_pulses import SensorCoverage, lost_pulses
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.scan_patterns.lasers import RingLasers
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city

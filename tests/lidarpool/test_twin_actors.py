@@ -13,11 +13,11 @@ from lidarfiles.clouds.recorded_boxes import RecordedBoxes
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, save_cloud, twin
-from lidarpool.reconstruction.moving_objects import find_tracks
-from lidarpool.reconstruction.moving_rays import MovingRays, SweepMasks
-from lidarpool.reconstruction.object_clusters import find_clusters
-from lidarpool.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
-from lidarpool.reconstruction.object_tracks import ObjectTrack
+from lidarreal.reconstruction.moving_objects import find_tracks
+from lidarreal.reconstruction.moving_rays import MovingRays, SweepMasks
+from lidarreal.reconstruction.object_clusters import find_clusters
+from lidarreal.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
+from lidarreal.reconstruction.object_tracks import ObjectTrack
 from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.sweeps.sweeps import Sweeps
 

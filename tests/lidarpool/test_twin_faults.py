@@ -24,7 +24,7 @@ from lidarfiles.work.mapping import parallel_map
 from lidarfiles.work.work import FOLDER
 from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 
 pytest.importorskip("scipy")
 

@@ -13,13 +13,13 @@ from tests.simulated_drives import simulated_drive
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Beams, Mounted, Pose, Sensor, Survey, load_sensor, twin
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
-from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import RecordedPoses
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
+from lidarreal.reconstruction.free_space import RangeImage
+from lidarreal.reconstruction.lost_pulses import SensorCoverage, lost_pulses
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import RecordedPoses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 

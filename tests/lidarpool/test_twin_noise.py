@@ -12,14 +12,14 @@ from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_la
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Sensor, load_sensor, twin
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, align
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import RecordedPoses
-from lidarpool.reconstruction.range_noise import estimate_range_noise
-from lidarpool.reconstruction.recorded_sensor import SweepTiming
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, align
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import RecordedPoses
+from lidarreal.reconstruction.range_noise import estimate_range_noise
+from lidarreal.reconstruction.recorded_sensor import SweepTiming
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 

@@ -9,25 +9,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool.reconstruction.moving_objects import _on_ground, find_tracks
-from lidarpool.reconstruction.moving_rays import MovingRays, box_distances
-from lidarpool.reconstruction.object_clusters import (
+from lidarreal.reconstruction.moving_objects import _on_ground, find_tracks
+from lidarreal.reconstruction.moving_rays import MovingRays, box_distances
+from lidarreal.reconstruction.object_clusters import (
     ClusterTrack,
     PointCluster,
     bounding_boxes,
     find_clusters,
     track_clusters,
 )
-from lidarpool.reconstruction.object_surfels import (
+from lidarreal.reconstruction.object_surfels import (
     RecordedObject,
     cast_to_objects,
     reconstruct_objects,
 )
-from lidarpool.reconstruction.object_tracks import ObjectTrack, in_any_box, rotate_z
-from lidarpool.reconstruction.recorded_actors import actors_of, class_names
-from lidarpool.reconstruction.submap_objects import ObjectMap, ObjectTask
-from lidarpool.reconstruction.surface_map import Observations
-from lidarpool.reconstruction.surfels import Surfels, surfel_mesh
+from lidarreal.reconstruction.object_tracks import ObjectTrack, in_any_box, rotate_z
+from lidarreal.reconstruction.recorded_actors import actors_of, class_names
+from lidarreal.reconstruction.submap_objects import ObjectMap, ObjectTask
+from lidarreal.reconstruction.surface_map import Observations
+from lidarreal.reconstruction.surfels import Surfels, surfel_mesh
 
 pytest.importorskip("scipy")
 

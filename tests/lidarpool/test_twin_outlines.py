@@ -22,9 +22,9 @@ from lidarpool import (
     load_sensor,
     twin,
 )
-from lidarpool.reconstruction.outlines import Extents, crossed_cells
-from lidarpool.reconstruction.porosity import Crossings
-from lidarpool.reconstruction.surfels import Surfels, surfel_mesh
+from lidarreal.reconstruction.outlines import Extents, crossed_cells
+from lidarreal.reconstruction.porosity import Crossings
+from lidarreal.reconstruction.surfels import Surfels, surfel_mesh
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarsim.sweeps.sweeps import Sweeps

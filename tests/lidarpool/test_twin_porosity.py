@@ -9,7 +9,7 @@ from tests.shapes import wall
 from tests.simulated_drives import simulated_drive, simulated_points
 
 from lidarpool import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, twin
-from lidarpool.reconstruction.porosity import Crossings, Porosity
+from lidarreal.reconstruction.porosity import Crossings, Porosity
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 

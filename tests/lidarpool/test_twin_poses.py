@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
-from lidarpool.reconstruction.blocked_directions import BlockedDirections
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.motion import Motion, MotionStep
-from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.voxel_planes import VoxelPlanes, cell_keys, smallest_by_cell
-from lidarpool.scan_patterns.lasers import RingLasers
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
+from lidarreal.reconstruction.blocked_directions import BlockedDirections
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion, MotionStep
+from lidarreal.reconstruction.odometry import RecordedPoses, find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.voxel_planes import VoxelPlanes, cell_keys, smallest_by_cell
+from lidarreal.scan_patterns.lasers import RingLasers
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("small_gicp")

@@ -10,18 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool.reconstruction import recorded_sensor
-from lidarpool.reconstruction.air_returns import AirStatistics, find_air_returns
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
-from lidarpool.reconstruction.blocked_directions import BlockedDirections
-from lidarpool.reconstruction.lost_pulses import SensorCoverage, firings_per_turn, lost_pulses
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.moving_rays import TimedPulses, collect_moving_rays
-from lidarpool.reconstruction.object_tracks import ObjectTrack
-from lidarpool.reconstruction.recorded_sensor import SweepTiming
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps, ring_starts
-from lidarpool.reconstruction.reflectances import IntensityModel, Response
-from lidarpool.scan_patterns.lasers import RingLasers
+from lidarreal.reconstruction import recorded_sensor
+from lidarreal.reconstruction.air_returns import AirStatistics, find_air_returns
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
+from lidarreal.reconstruction.blocked_directions import BlockedDirections
+from lidarreal.reconstruction.lost_pulses import SensorCoverage, firings_per_turn, lost_pulses
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.moving_rays import TimedPulses, collect_moving_rays
+from lidarreal.reconstruction.object_tracks import ObjectTrack
+from lidarreal.reconstruction.recorded_sensor import SweepTiming
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps, ring_starts
+from lidarreal.reconstruction.reflectances import IntensityModel, Response
+from lidarreal.scan_patterns.lasers import RingLasers
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("scipy")

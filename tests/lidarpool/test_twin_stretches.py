@@ -19,9 +19,9 @@ from tests.city_drives import write_city_drive
 import poolpart.deploy
 from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
-from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.motion import Motion, MotionStep
-from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
+from lidarreal.reconstruction.alignment import Alignment
+from lidarreal.reconstruction.motion import Motion, MotionStep
+from lidarreal.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
 
 pytest.importorskip("scipy")
 

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recorded_boxes import RecordedBoxes
-from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.moving_objects import LabeledTracks, find_tracks
-from lidarpool.reconstruction.moving_rays import MovingRays
-from lidarpool.reconstruction.object_poses import (
+from lidarreal.reconstruction.alignment import Alignment
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.moving_objects import LabeledTracks, find_tracks
+from lidarreal.reconstruction.moving_rays import MovingRays
+from lidarreal.reconstruction.object_poses import (
     Shape,
     Sighting,
     adjust_poses,
     register,
     velocities_of,
 )
-from lidarpool.reconstruction.object_tracks import ObjectTrack, rotate_z
+from lidarreal.reconstruction.object_tracks import ObjectTrack, rotate_z
 
 pytest.importorskip("scipy")
 

@@ -12,29 +12,29 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool.reconstruction.alignment import AlignedSweep, Alignment
-from lidarpool.reconstruction.blocked_directions import PulseCounts
-from lidarpool.reconstruction.free_space import RangeImage, find_stationary_points, locate
-from lidarpool.reconstruction.held_out import HeldOutRays
-from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
-from lidarpool.reconstruction.motion import Motion, MotionStep
-from lidarpool.reconstruction.odometry import RecordedPoses
-from lidarpool.reconstruction.porosity import Crossings, Porosity
-from lidarpool.reconstruction.range_noise import RingNeighbors
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.reflectances import (
+from lidarreal.reconstruction.alignment import AlignedSweep, Alignment
+from lidarreal.reconstruction.blocked_directions import PulseCounts
+from lidarreal.reconstruction.free_space import RangeImage, find_stationary_points, locate
+from lidarreal.reconstruction.held_out import HeldOutRays
+from lidarreal.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
+from lidarreal.reconstruction.motion import Motion, MotionStep
+from lidarreal.reconstruction.odometry import RecordedPoses
+from lidarreal.reconstruction.porosity import Crossings, Porosity
+from lidarreal.reconstruction.range_noise import RingNeighbors
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.reflectances import (
     IntensityModel,
     Response,
     fit_response,
     incidence_factors,
 )
-from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
-from lidarpool.reconstruction.surface_map import Observations, SurfaceMap, median_shifts
-from lidarpool.reconstruction.surfels import Surfels, principal_axes, surfel_mesh
-from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
-from lidarpool.reconstruction.vehicle_returns import VehicleReturns
-from lidarpool.reconstruction.visibility import estimate_visibility
-from lidarpool.scan_patterns.lasers import RingLasers
+from lidarreal.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
+from lidarreal.reconstruction.surface_map import Observations, SurfaceMap, median_shifts
+from lidarreal.reconstruction.surfels import Surfels, principal_axes, surfel_mesh
+from lidarreal.reconstruction.vehicle_detection import find_vehicle_returns
+from lidarreal.reconstruction.vehicle_returns import VehicleReturns
+from lidarreal.reconstruction.visibility import estimate_visibility
+from lidarreal.scan_patterns.lasers import RingLasers
 from lidarscenario.points.point_scene import CLASS_MATERIAL
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.materials import extinction

@@ -24,14 +24,14 @@ from lidarpool import (
     box,
     twin,
 )
-from lidarpool.reconstruction.air_returns import find_air_returns
-from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
-from lidarpool.reconstruction.isolated_returns import IsolatedRanges, same_range_neighbors
-from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.motion import Motion
-from lidarpool.reconstruction.odometry import find_poses
-from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
+from lidarreal.reconstruction.air_returns import find_air_returns
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
+from lidarreal.reconstruction.isolated_returns import IsolatedRanges, same_range_neighbors
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 

@@ -138,15 +138,15 @@ OPTIONAL = {
     "laspy": ("lidarfiles/clouds/las",),
     "lazrs": ("lidarfiles/clouds/las",),
     "llvmlite": ("raybeam/",),  # comes with numba
-    "lpips": ("lidarpool/comparing/lidar4d.py",),
-    "lz4": ("lidarpool/augmentation/rewriting/mcap_copy.py",),  # comes with rosbags
+    "lpips": ("lidarreal/comparing/lidar4d.py",),
+    "lz4": ("lidarreal/augmentation/rewriting/mcap_copy.py",),  # comes with rosbags
     "mujoco": ("lidarscenes/mujoco/model_child.py",),
     "numba": ("raybeam/",),
     "ouster": ("lidarsim/packets/ouster.py",),
     "pandas": ("poolpart/task_table.py",),
     "prometheus_client": ("poolpart/extras/metrics.py",),
     "pxr": ("lidarscenes/files/usd_child.py", "lidarscenes/sensors/omnilidar_child.py"),
-    "py4dgeo": ("lidarpool/comparing/surveys/m3c2.py",),
+    "py4dgeo": ("lidarreal/comparing/surveys/m3c2.py",),
     "pyarrow": (
         "lidarfiles/clouds/parquet", "lidarfiles/datasets/job_table.py",
         "lidarsim/sensor_files/ray_parquet.py",
@@ -159,13 +159,13 @@ OPTIONAL = {
     ),
     "rerun": ("lidarfiles/clouds/rrd.py", "lidarpool/viewers/rerun_server.py"),
     "rosbags": (
-        "lidarpool/augmentation/rewriting/bag_rewriter.py", "lidarfiles/clouds/ros/",
+        "lidarreal/augmentation/rewriting/bag_rewriter.py", "lidarfiles/clouds/ros/",
         "lidarpool/following/pose_input.py", "lidarpool/playback/dds.py",
         "lidarsim/columns/bags.py", "lidarsim/columns/closing_bag.py",
     ),
     "shapely": ("lidarscenario/plan/flight_",),
-    "small_gicp": ("lidarpool/reconstruction/odometry.py",),
-    "torch": ("lidarpool/comparing/lidar4d.py", "lidarfiles/datasets/torch_sweeps.py"),
+    "small_gicp": ("lidarreal/reconstruction/odometry.py",),
+    "torch": ("lidarreal/comparing/lidar4d.py", "lidarfiles/datasets/torch_sweeps.py"),
     "velodyne_decoder": ("lidarsim/packets/velodyne.py",),
 }  # fmt: skip
 

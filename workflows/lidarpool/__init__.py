@@ -13,6 +13,15 @@ if TYPE_CHECKING:
     from lidarfiles.clouds.writing import save_cloud
     from lidarfiles.datasets.loader import sweeps
     from lidarfiles.recordings.opening import open_recording
+    from lidarreal.augmentation.effects import Effects, Insertion
+    from lidarreal.augmentation.transform import Augment, augment
+    from lidarreal.comparing.comparison import Comparison
+    from lidarreal.comparing.fit.fitting import Fit, fit
+    from lidarreal.comparing.surveys import SurveyComparison, compare_strips, compare_surveys
+    from lidarreal.comparing.two_clouds import compare
+    from lidarreal.reconstruction.building import twin
+    from lidarreal.reconstruction.twin import Twin
+    from lidarreal.scan_patterns import PatternFit, fit_pattern
     from lidarscenario.job import Job
     from lidarscenario.plan import Plan, Planning
     from lidarscenes.robots.robot import Robot
@@ -41,21 +50,12 @@ if TYPE_CHECKING:
     from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
-    from .augmentation.effects import Effects, Insertion
-    from .augmentation.transform import Augment, augment
-    from .comparing.comparison import Comparison
-    from .comparing.fit.fitting import Fit, fit
-    from .comparing.surveys import SurveyComparison, compare_strips, compare_surveys
-    from .comparing.two_clouds import compare
     from .pages.scanner_page import show
     from .playback.live import play
-    from .reconstruction.building import twin
-    from .reconstruction.twin import Twin
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
-    from .scan_patterns import PatternFit, fit_pattern
     from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [

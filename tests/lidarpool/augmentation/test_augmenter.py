@@ -8,10 +8,10 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import Fault, Pose, Scanner, Scene, Track, load_sensor
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.augmentation.insertions import load_insertion
-from lidarpool.augmentation.object_classes import find_class
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.insertions import load_insertion
+from lidarreal.augmentation.object_classes import find_class
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError
@@ -473,7 +473,7 @@ def test_results_do_not_depend_on_how_pulses_are_divided(clear, sensor, monkeypa
 
 @pytest.mark.parametrize("seed", range(4))
 def test_points_are_sorted_by_the_closest_return_of_their_channel(seed):
-    from lidarpool.augmentation.grid_loops import sort_points
+    from lidarreal.augmentation.grid_loops import sort_points
 
     rng = np.random.default_rng(seed)
     firings, channels = 40, 8

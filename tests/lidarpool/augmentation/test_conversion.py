@@ -13,9 +13,9 @@ from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import LidarError, read_cloud
-from lidarpool.augmentation.augmented_sweep import AugmentedSweep
-from lidarpool.augmentation.conversion import open_converter
-from lidarpool.augmentation.rewriting.opening import open_rewriter
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.conversion import open_converter
+from lidarreal.augmentation.rewriting.opening import open_rewriter
 
 
 def converter(path, spec, sensor=None):

@@ -10,8 +10,8 @@ import pytest
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarpool import LidarError
-from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.augmentation.insertions import load_insertion
+from lidarreal.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.insertions import load_insertion
 from lidarscenario.scenario import Scenario
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import Weather

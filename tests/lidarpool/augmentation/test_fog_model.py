@@ -17,8 +17,8 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import Material, Noise, Pose, Scanner, Scene, Survey, load_sensor
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene_mesh import SceneMesh

@@ -16,13 +16,13 @@ from tests.street_recordings import COUNT, record, reflectances, street
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import load_sensor
-from lidarpool.augmentation.intensity_fit import (
+from lidarreal.augmentation.intensity_fit import (
     NearFactors,
     Quantization,
     RecordedReturns,
     is_compensated,
 )
-from lidarpool.augmentation.intensity_scale import IntensityScale
+from lidarreal.augmentation.intensity_scale import IntensityScale
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import normal_incidence_energy

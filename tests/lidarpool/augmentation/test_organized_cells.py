@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarpool.augmentation.augmented_sweep import AugmentedSweep
-from lidarpool.augmentation.rewriting.organized_cells import assign_cells
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.rewriting.organized_cells import assign_cells
 from lidarsim.columns.sweep import Sweep
 
 RINGS, COLUMNS = 4, 90

@@ -13,8 +13,8 @@ from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool.augmentation.rewriting.opening import open_rewriter
-from lidarpool.augmentation.rewriting.stored_records import StoredRecords, convert_values
+from lidarreal.augmentation.rewriting.opening import open_rewriter
+from lidarreal.augmentation.rewriting.stored_records import StoredRecords, convert_values
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.files.lzf_loops import pack_lzf, packed_limit, unpack_lzf
 from lidarsim.scene.files.pcd import PCDRecords, read_pcd

@@ -9,7 +9,7 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, Sensor, load_sensor
-from lidarpool.augmentation.resampling import SensorResampler
+from lidarreal.augmentation.resampling import SensorResampler
 from lidarsim.columns.sweep import Sweep
 
 # Distances of the walls, the floor and the ceiling from the sensor, which is not in the center.

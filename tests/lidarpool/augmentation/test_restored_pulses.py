@@ -7,9 +7,9 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import Noise, Scanner, Scene, Track, load_sensor
-from lidarpool.augmentation.augmenter import Augmenter
-from lidarpool.augmentation.effects import Effects
-from lidarpool.augmentation.scan_pattern import ScanPattern
+from lidarreal.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.effects import Effects
+from lidarreal.augmentation.scan_pattern import ScanPattern
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.weather import Weather

@@ -17,10 +17,10 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 import poolpart.deploy
 from lidarfiles.work.work import FOLDER, Work
 from lidarpool import LidarError, box, load_sensor, open_recording
-from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.augmentation.running import WORK_SUFFIX, Augmentation
-from lidarpool.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
-from lidarpool.augmentation.variants import CampaignVariants, Variants
+from lidarreal.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.running import WORK_SUFFIX, Augmentation
+from lidarreal.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
+from lidarreal.augmentation.variants import CampaignVariants, Variants
 from lidarsim.io.storage import Storage
 
 SWEEPS = 8
@@ -38,11 +38,11 @@ splits: {train: 0.5, val: 0.5}
 SLOW = """\
 import sys, time
 from pathlib import Path
-from lidarpool.augmentation import running
-from lidarpool.augmentation.effects import Effects
-from lidarpool.augmentation.running import Augmentation
-from lidarpool.augmentation.sweep_tasks import RecordingFile
-from lidarpool.augmentation.variants import Variants
+from lidarreal.augmentation import running
+from lidarreal.augmentation.effects import Effects
+from lidarreal.augmentation.running import Augmentation
+from lidarreal.augmentation.sweep_tasks import RecordingFile
+from lidarreal.augmentation.variants import Variants
 
 def pause(done, total):
     print(done, flush=True)
@@ -484,7 +484,7 @@ def test_a_variant_does_not_depend_on_the_others(augmentation, campaign, tmp_pat
 
 @pytest.mark.extended
 def test_interrupted_campaigns_continue(augmentation, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidarpool.augmentation.running.MAX_VARIANTS", 2)
+    monkeypatch.setattr("lidarreal.augmentation.running.MAX_VARIANTS", 2)
     variants = replace(augmentation, variants=CampaignVariants(campaign))
     variants.run(tmp_path / "expected", workers=1)
     out = tmp_path / "out"

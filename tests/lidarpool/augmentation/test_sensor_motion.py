@@ -9,10 +9,10 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import LidarError, box
-from lidarpool.augmentation.effects import Effects, Insertion
-from lidarpool.augmentation.ground_plane import GroundPlane
-from lidarpool.augmentation.inserted_objects import InsertedObjects
-from lidarpool.augmentation.sensor_motion import SensorMotion
+from lidarreal.augmentation.effects import Effects, Insertion
+from lidarreal.augmentation.ground_plane import GroundPlane
+from lidarreal.augmentation.inserted_objects import InsertedObjects
+from lidarreal.augmentation.sensor_motion import SensorMotion
 from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import rotations_of
 

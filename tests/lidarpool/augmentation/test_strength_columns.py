@@ -10,9 +10,9 @@ from tests.street_recordings import record, reflectances
 
 from lidarfiles.clouds.recording import Recording
 from lidarpool import load_sensor
-from lidarpool.augmentation.detection_threshold import detection_threshold
-from lidarpool.augmentation.intensity_scale import IntensityScale
-from lidarpool.augmentation.strength_columns import StrengthColumns
+from lidarreal.augmentation.detection_threshold import detection_threshold
+from lidarreal.augmentation.intensity_scale import IntensityScale
+from lidarreal.augmentation.strength_columns import StrengthColumns
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.reflectivity import SCALES
 

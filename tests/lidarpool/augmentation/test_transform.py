@@ -24,7 +24,7 @@ from lidarpool import (
     load_sensor,
     open_recording,
 )
-from lidarpool.augmentation.augmenter import Augmenter
+from lidarreal.augmentation.augmenter import Augmenter
 
 RAIN = {"rain_mm_h": 50, "visibility_km": 0.2}
 COLUMNS = ("intensity", "ring")

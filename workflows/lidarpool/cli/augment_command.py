@@ -20,8 +20,9 @@ from .first_step import print_first_step
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
-    from ..augmentation.effects import Insertion
-    from ..augmentation.variants import Variants
+    from lidarreal.augmentation.effects import Insertion
+    from lidarreal.augmentation.variants import Variants
+
     from ..connection.tls_files import TlsFiles
 
 _PACKET_FIRINGS = 16  # firings per packet of --dropped-packets
@@ -300,9 +301,9 @@ def augment(
     placements = _placements(settings)
     print_first_step("reading the recording", quiet=quiet)
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarreal.augmentation.running import Augmentation
+    from lidarreal.augmentation.sweep_tasks import RecordingFile
 
-    from ..augmentation.running import Augmentation
-    from ..augmentation.sweep_tasks import RecordingFile
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 
@@ -353,10 +354,9 @@ def _variants(
     allow_empty: bool,
 ) -> Variants:
     """Return the variants of effects in a file, with the effects of options."""
+    from lidarreal.augmentation.effects import Effects
+    from lidarreal.augmentation.variants import CampaignVariants, Variants
     from lidarscenario.campaign.campaign_file import is_campaign
-
-    from ..augmentation.effects import Effects
-    from ..augmentation.variants import CampaignVariants, Variants
 
     sections = _sections(settings)
     seed = settings["seed"]
@@ -449,8 +449,8 @@ def _placements(settings: dict[str, Any]) -> list[_Placement]:
 
 
 def _load_insertion(placement: _Placement, terminal: Any) -> Insertion:
-    from ..augmentation.effects import Insertion
-    from ..augmentation.insertions import load_insertion
+    from lidarreal.augmentation.effects import Insertion
+    from lidarreal.augmentation.insertions import load_insertion
 
     mesh = load_insertion(placement.shape, terminal.report)
     kind = placement.class_name or (placement.shape if placement.shape in INSERTIONS else "")

@@ -17,8 +17,8 @@ from lidarsim.words import join_alternatives, join_names
 from . import shared_options as options
 
 if TYPE_CHECKING:
-    from ..comparing.comparison import Comparison
-    from ..comparing.surveys import SurveyComparison
+    from lidarreal.comparing.comparison import Comparison
+    from lidarreal.comparing.surveys import SurveyComparison
 
 STRIPS = "strips"
 SURVEY_METHODS = ("auto", "pairs", "planes", "m3c2", "mesh", STRIPS)
@@ -236,11 +236,11 @@ def _compared(
         return {name: settings[name] for name in names}
 
     if survey is None:
-        from ..comparing.two_clouds import compare as compare_clouds
+        from lidarreal.comparing.two_clouds import compare as compare_clouds
 
         kept = chosen(*_SWEEP_OPTIONS, *_CLOUD_OPTIONS, *_SHARED)
         return compare_clouds(a, others[0], **kept)
-    from ..comparing.surveys import compare_strips, compare_surveys
+    from lidarreal.comparing.surveys import compare_strips, compare_surveys
 
     if survey == STRIPS:
         return compare_strips(a, *others, **chosen(*_STRIP_OPTIONS, *_SHARED))

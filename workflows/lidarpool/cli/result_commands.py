@@ -405,8 +405,7 @@ def fit(
     """  # noqa: D301 - Click requires the character \b
     from lidarfiles.clouds.folder import check_not_existing
     from lidarfiles.processes.freed_memory import keep_freed_memory
-
-    from ..comparing.fit.fitting import fit as fitted
+    from lidarreal.comparing.fit.fitting import fit as fitted
 
     keep_freed_memory()
     if pattern:
@@ -429,9 +428,8 @@ def _fit_pattern(
 ) -> None:
     """Estimate a scan pattern. The extension of the output file selects its form."""
     from lidarfiles.clouds.folder import check_not_existing
+    from lidarreal.scan_patterns.fitting import check_pattern_file, fit_pattern
     from lidarsim.sensor.models import MODEL_FILES
-
-    from ..scan_patterns.fitting import check_pattern_file, fit_pattern
 
     unused = [name for name, value in settings.items() if value]
     if unused:

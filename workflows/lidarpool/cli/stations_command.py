@@ -269,10 +269,10 @@ def _show_coverage(
     The visible area is the area that can be seen from the stations of the scenario.
     """
     from lidarfiles.recordings.opening import open_recording
+    from lidarreal.comparing.compared_sweep import compared_in_world
+    from lidarreal.comparing.stated_frames import StatedFrame, check_same_systems
     from lidarscenario.plan.stations import survey_coverage
 
-    from ..comparing.compared_sweep import compared_in_world
-    from ..comparing.stated_frames import StatedFrame, check_same_systems
     from .terminal import Terminal
 
     if scenario.poses is None:

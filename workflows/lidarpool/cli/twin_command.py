@@ -87,9 +87,9 @@ def twin(
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - Click requires the character \b
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarreal.reconstruction.building import twin as build
+    from lidarreal.reconstruction.twin import SCENARIO_FILE
 
-    from ..reconstruction.building import twin as build
-    from ..reconstruction.twin import SCENARIO_FILE
     from ..run.cluster.connection import connect_client
 
     options.check_unfinished(resume=resume, restart=restart)

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarreal.reconstruction.recorded_actors import FOLDER as ACTORS_FOLDER
+from lidarreal.reconstruction.twin import FIGURES_FILE, SCENARIO_FILE
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenario.sections import OutputSection, SensorSection
@@ -26,9 +28,6 @@ from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.scanner import Scanner
 from lidarsim.words import format_rounded, name_hint, printable
-
-from ..reconstruction.recorded_actors import FOLDER as ACTORS_FOLDER
-from ..reconstruction.twin import FIGURES_FILE, SCENARIO_FILE
 
 # Maximum relative difference between the durations of a frame and of a sweep. The rotation rate of
 # a real sensor also varies.

@@ -24,12 +24,7 @@ from lidarsim.words import join_names, plural
 
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set, place_file
-from .nuscenes_categories import (
-    OTHER_CATEGORY,
-    attribute_tokens,
-    find_category,
-    visibility_token,
-)
+from .nuscenes_categories import OTHER_CATEGORY, attribute_tokens, find_category, visibility_token
 from .rewriter import EncodedSweeps, Rewriter, box_details
 from .stored_records import StoredRecords, unchanged
 

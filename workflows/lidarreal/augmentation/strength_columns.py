@@ -20,13 +20,7 @@ from lidarsim.sensor.reflectivity import SCALES, ByteScale
 from lidarsim.sensor.sensor import Sensor
 
 from .detection_threshold import DetectionThreshold, detection_threshold
-from .intensity_fit import (
-    Quantization,
-    RecordedReturns,
-    is_valid,
-    range_factors,
-    smallest_positive,
-)
+from .intensity_fit import Quantization, RecordedReturns, is_valid, range_factors, smallest_positive
 from .intensity_scale import IntensityScale
 
 # Columns that contain the strength of returns. Ambient light, such as `ambient` and `near_ir`, does

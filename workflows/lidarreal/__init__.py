@@ -1,0 +1,1 @@
+"""Recorded sweeps: comparison, fitted sensors, simulated weather, and reconstructed scenes."""
