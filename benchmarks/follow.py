@@ -58,7 +58,7 @@ def simulate(domain: int) -> None:
     """Publish the clock and poses until the process is killed."""
     from tests.simulators import clock, transforms
 
-    from lidarpool.playback.dds import Network, RosPublisher
+    from lidarlive.playback.dds import Network, RosPublisher
 
     with RosPublisher(Network(domain=domain)) as publisher:
         begin_s = time.monotonic()

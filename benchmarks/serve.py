@@ -25,9 +25,9 @@ import numpy as np
 import psutil
 import yaml
 
-from lidarpool.serving.conversion import sweep_request
-from lidarpool.serving.messages import SERVICE, message_class
-from lidarpool.serving.served_scene import load_served_scene
+from lidarlive.serving.conversion import sweep_request
+from lidarlive.serving.messages import SERVICE, message_class
+from lidarlive.serving.served_scene import load_served_scene
 
 SENSORS = ("velodyne/vlp16", "hesai/at128", "hesai/pandar128")
 CARS = 20

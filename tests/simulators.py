@@ -80,7 +80,7 @@ class Simulator:
     def __init__(
         self, domain: int, frames: Callable[[float], Iterable[Placed]], rate_hz: float = 50.0
     ) -> None:
-        from lidarpool.playback import dds
+        from lidarlive.playback import dds
 
         self.publisher = dds.RosPublisher(dds.Network(domain=domain))
         self.frames = frames

@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 from tests.spirals import WET, spiral, spiral_view
 
-from lidarpool.playback.services import service_of
+from lidarlive.devices.services import service_of
 from lidarsim import load_sensor
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination

@@ -14,6 +14,7 @@ from tests.chaos.target import Target
 from tests.shapes import block
 
 from lidarfiles.recordings.opening import open_sensors
+from lidarlive.playback.pcap_recording import PcapRecording
 from lidarpool import (
     Actor,
     LidarError,
@@ -26,7 +27,6 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.playback.pcap_recording import PcapRecording
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from raybeam.compiled import compiled

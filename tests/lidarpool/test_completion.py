@@ -12,8 +12,8 @@ from click.shell_completion import CompletionItem, ShellComplete
 from tests.plugin_files import write_distribution
 
 from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS
+from lidarlive.playback.bridge_table import BRIDGES
 from lidarpool.cli.commands import cli
-from lidarpool.playback.bridge_table import BRIDGES
 from lidarsim.columns.table import OPTIONAL, TABLE
 from lidarsim.schema.model_names import model_names
 from lidarsim.schema.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS

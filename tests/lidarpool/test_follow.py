@@ -21,6 +21,10 @@ from tests import simulators
 from tests.simulators import clock, joint_states, transforms
 
 from lidarfiles.clouds.ros.messages import RosMessage, message_store
+from lidarlive.following.node import FollowOptions
+from lidarlive.following.notices import Notices
+from lidarlive.following.opening import FollowSources, create_node
+from lidarlive.following.pose_input import is_wanted
 from lidarpool import (
     LidarError,
     Material,
@@ -32,10 +36,6 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.cli.follow_command import follow
-from lidarpool.following.node import FollowOptions
-from lidarpool.following.notices import Notices
-from lidarpool.following.opening import FollowSources, create_node
-from lidarpool.following.pose_input import is_wanted
 from lidarscenario.sensors_file import SensorsFile
 from lidarsim.motion.rotations import matrices
 
@@ -66,7 +66,7 @@ def dds(monkeypatch) -> Any:
     """The module that publishes; tests skip without cyclonedds."""
     pytest.importorskip("cyclonedds.core")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
-    from lidarpool.playback import dds
+    from lidarlive.playback import dds
 
     return dds
 
@@ -726,10 +726,10 @@ def test_poses_of_a_restarted_simulator_may_arrive_before_its_clock(folder, monk
 
 
 def test_the_clock_is_stated_after_waiting(folder, monkeypatch):
-    monkeypatch.setattr("lidarpool.following.node._QUIET_S", 0)
+    monkeypatch.setattr("lidarlive.following.node._QUIET_S", 0)
     with Loop("room.sdf") as loop:
         loop.do_what_is_due()
-        monkeypatch.setattr("lidarpool.following.node._QUIET_S", 60)
+        monkeypatch.setattr("lidarlive.following.node._QUIET_S", 60)
         loop.play(lambda _: STILL, 0, 0.3)
     waiting, received = loop.notes
     assert waiting.endswith("Waiting.") and received == "Messages on /clock are arriving."
@@ -737,7 +737,7 @@ def test_the_clock_is_stated_after_waiting(folder, monkeypatch):
 
 def test_a_clock_that_is_missing_or_shared_is_stated(folder, monkeypatch):
     with Loop("room.sdf") as loop:
-        monkeypatch.setattr("lidarpool.following.node._QUIET_S", 0)
+        monkeypatch.setattr("lidarlive.following.node._QUIET_S", 0)
         loop.node.step()
         loop.programs = 0
         loop.node.step()
@@ -756,7 +756,7 @@ def test_repeated_events_are_counted(monkeypatch):
     for count in (1, 2):
         for _ in range(count):
             notices.show_event("key", "An event.")
-        monkeypatch.setattr("lidarpool.following.notices._PERIOD_S", -1)
+        monkeypatch.setattr("lidarlive.following.notices._PERIOD_S", -1)
         notices.show_event("key", "An event.")
         monkeypatch.undo()
     assert shown == ["An event.", "An event.", "An event. (2 more such events were not shown.)"]

@@ -12,13 +12,13 @@ import pytest
 from click.testing import CliRunner
 
 from lidarfiles.clouds.writing import ExportSpec
+from lidarlive.playback import bridge as bridges
+from lidarlive.playback.bridge import Bridge
+from lidarlive.playback.bridge_table import BRIDGES, BridgeEntry
+from lidarlive.playback.schedule import Prefetcher
+from lidarlive.playback.sources import open_source
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.playback import bridge as bridges
-from lidarpool.playback.bridge import Bridge
-from lidarpool.playback.bridge_table import BRIDGES, BridgeEntry
-from lidarpool.playback.schedule import Prefetcher
-from lidarpool.playback.sources import open_source
 
 SCENARIO = """
 sensor: {model: velodyne/vlp16, rate_hz: 20}

@@ -24,6 +24,10 @@ from click.testing import CliRunner
 from tests.shapes import room
 
 from lidarfiles.clouds.writing import ExportSpec
+from lidarlive.playback.live_sensor import RepeatedInstruments
+from lidarlive.playback.pcap_recording import PcapRecording
+from lidarlive.playback.sources import open_source, scenario_job
+from lidarlive.playback.transmitter import Transmitter, sensor_streams
 from lidarpool import (
     Cloud,
     LidarError,
@@ -39,10 +43,6 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.playback.live_sensor import RepeatedInstruments
-from lidarpool.playback.pcap_recording import PcapRecording
-from lidarpool.playback.sources import open_source, scenario_job
-from lidarpool.playback.transmitter import Transmitter, sensor_streams
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -341,8 +341,8 @@ def test_casting_that_falls_behind_is_said_once_and_loses_no_packet(
         time.sleep(0.2)
         return columns_of(batches)
 
-    monkeypatch.setattr("lidarpool.playback.sources.columns_of", columns_of_slow_cast)
-    monkeypatch.setattr("lidarpool.playback.sources.casting_threads", lambda: 1)
+    monkeypatch.setattr("lidarlive.playback.sources.columns_of", columns_of_slow_cast)
+    monkeypatch.setattr("lidarlive.playback.sources.casting_threads", lambda: 1)
     (tmp_path / "s.yaml").write_text(VLP16)
     to = f"127.0.0.1:{port_of(receiver)}"
     outcome = command("play", tmp_path / "s.yaml", "--as", "packets", "--to", to, "--rate", "1000")

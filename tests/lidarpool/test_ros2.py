@@ -20,10 +20,10 @@ from tests import simulators
 from tests.shapes import room
 
 from lidarfiles.clouds.ros.messages import RosMessage, message_store
+from lidarlive.playback.bridge import BridgeOptions, bridge_class
+from lidarlive.playback.schedule import Schedule
 from lidarpool import Cloud, LidarError, Sensor, Survey
 from lidarpool.cli.play_command import play
-from lidarpool.playback.bridge import BridgeOptions, bridge_class
-from lidarpool.playback.schedule import Schedule
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -56,7 +56,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 def dds() -> Any:
     """The module that publishes; tests skip without cyclonedds."""
     pytest.importorskip("cyclonedds.core")
-    from lidarpool.playback import dds
+    from lidarlive.playback import dds
 
     return dds
 
@@ -405,7 +405,7 @@ def test_options_that_do_not_fit_are_one_line(folder, dds, arguments, message):
 
 
 def test_a_cloud_without_the_columns_of_a_layout_is_one_line(dds, monkeypatch):
-    from lidarpool.playback.ros2 import Ros2Bridge
+    from lidarlive.playback.ros2 import Ros2Bridge
 
     monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN + 3))
     sweeps = Sweeps.from_survey(Survey(Sensor.grid(90, 4), poses=[(0, 0, 0)], steps=4), room())
@@ -424,7 +424,7 @@ def test_without_the_extra_the_error_says_what_to_install(monkeypatch):
     for name in list(sys.modules):
         if name.startswith("cyclonedds."):
             monkeypatch.setitem(sys.modules, name, None)
-        elif name.startswith("lidarpool.playback."):
+        elif name.startswith("lidarlive.playback."):
             monkeypatch.delitem(sys.modules, name)
     with pytest.raises(
         LidarError, match=r'`--as ros2` requires cyclonedds.*pip install -e "\.\[ros'

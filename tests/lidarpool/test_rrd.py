@@ -20,8 +20,8 @@ from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.writing import ExportSpec
+from lidarlive.playback.sources import open_source
 from lidarpool import Cloud, LidarError, save_cloud
-from lidarpool.playback.sources import open_source
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
 

@@ -30,12 +30,12 @@ from lidarsim.motion.rotations import quaternions_of
 grpc = pytest.importorskip("grpc")
 descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
 
-from lidarpool.serving import service as service_module  # noqa: E402
-from lidarpool.serving.conversion import sweep_request  # noqa: E402
-from lidarpool.serving.messages import METHODS, SERVICE, message_class, proto_text  # noqa: E402
-from lidarpool.serving.served_scene import load_served_scene  # noqa: E402
-from lidarpool.serving.server import Endpoint, SensorServer  # noqa: E402
-from lidarpool.serving.service import SensorService  # noqa: E402
+from lidarlive.serving import service as service_module  # noqa: E402
+from lidarlive.serving.conversion import sweep_request  # noqa: E402
+from lidarlive.serving.messages import METHODS, SERVICE, message_class, proto_text  # noqa: E402
+from lidarlive.serving.served_scene import load_served_scene  # noqa: E402
+from lidarlive.serving.server import Endpoint, SensorServer  # noqa: E402
+from lidarlive.serving.service import SensorService  # noqa: E402
 
 WALL = "v 10 -50 -5\nv 10 50 -5\nv 10 50 5\nv 10 -50 5\nf 1 2 3\nf 1 3 4\n"
 SENSOR = """

@@ -19,6 +19,11 @@ from tests.foxglove_client import FoxgloveClient, numbers, records, stamp_ns
 
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.shown_sweeps import ShownSweep, Surroundings
+from lidarlive.playback.bridge import BridgeOptions, bridge_class
+from lidarlive.playback.schedule import Schedule
+from lidarlive.playback.sources import open_source
+from lidarlive.viewers import attached_child
+from lidarlive.viewers.viewer import Address, Viewer, open_viewer
 from lidarpool import (
     Actor,
     Foxglove,
@@ -37,11 +42,6 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.playback.bridge import BridgeOptions, bridge_class
-from lidarpool.playback.schedule import Schedule
-from lidarpool.playback.sources import open_source
-from lidarpool.viewers import attached_child
-from lidarpool.viewers.viewer import Address, Viewer, open_viewer
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 
@@ -310,7 +310,7 @@ def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
 
 
 def test_what_is_missing_names_its_extra(room, monkeypatch, tmp_path):
-    monkeypatch.setattr("lidarpool.viewers.viewer.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarlive.viewers.viewer.find_spec", lambda name: None)
     scanner = Scanner(room, Sensor.grid(), backend="numpy")
     with pytest.raises(
         LidarError, match=r'requires foxglove-sdk\. Run pip install -e "\.\[live\]"'

@@ -8,8 +8,8 @@ import struct
 
 import pytest
 
+from lidarlive.devices.services import service_of
 from lidarpool import LidarError, load_sensor
-from lidarpool.playback.services import service_of
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
 

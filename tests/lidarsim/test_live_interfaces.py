@@ -15,9 +15,9 @@ from urllib.parse import quote
 
 import pytest
 
-from lidarpool.playback.services import service_of
+from lidarlive.devices import http_service
+from lidarlive.devices.services import service_of
 from lidarsim import LidarError, load_sensor
-from lidarsim.packets import http_service
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_shots
 
+from lidarlive.devices.send import Sender
+from lidarlive.devices.services import service_of
+from lidarlive.playback.transmitter import sensor_streams
 from lidarpool import LidarError, load_sensor
-from lidarpool.playback.services import service_of
-from lidarpool.playback.transmitter import sensor_streams
 from lidarsim.packets.encoders import PacketSource, encoder_of
-from lidarsim.packets.send import Sender
 from lidarsim.packets.service import Destination
 
 # Livox's ports are fixed: processes that test at the same time have addresses of their own.

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidarlive.devices import sender_process
+from lidarlive.devices.send import ReceiverAddress, Sender, check_reachable
 from lidarsim import LidarError
-from lidarsim.packets import sender_process
 from lidarsim.packets.encoders import Datagrams
-from lidarsim.packets.send import ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination
 
 
@@ -137,7 +137,7 @@ def test_the_process_ends_with_its_parent(number):
     code = """
 import time, numpy as np
 from lidarsim.packets.encoders import Datagrams
-from lidarsim.packets.send import Sender
+from lidarlive.devices.send import Sender
 from lidarsim.packets.service import Destination
 with Sender() as sender:
     sender.redirect(0, Destination("127.0.0.1"))

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from lidarfiles.clouds.writing import save_cloud
     from lidarfiles.datasets.loader import sweeps
     from lidarfiles.recordings.opening import open_recording
+    from lidarlive.playback.live import play
+    from lidarlive.viewers.scanner_view import Foxglove, Rerun
     from lidarreal.augmentation.effects import Effects, Insertion
     from lidarreal.augmentation.transform import Augment, augment
     from lidarreal.comparing.comparison import Comparison
@@ -51,12 +53,10 @@ if TYPE_CHECKING:
     from .api.result import Result
     from .api.simulation import Campaign, simulate
     from .pages.scanner_page import show
-    from .playback.live import play
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
-    from .viewers.scanner_view import Foxglove, Rerun
 
 __all__ = [
     "Actor",

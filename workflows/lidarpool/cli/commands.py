@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 from click.shell_completion import CompletionItem
 
+from lidarlive.viewers.viewer_table import PAGE, VIEWERS
 from lidarscenario.shard import ALL
 from lidarsim._version import __version__
 from lidarsim.environment.interrupts import (
@@ -33,7 +34,6 @@ from lidarsim.words import plural
 
 from ..processes.logs import set_logs
 from ..processes.rare_collections import no_collections
-from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
 from .augment_command import augment

@@ -13,6 +13,8 @@ import click
 from click.shell_completion import CompletionItem
 
 from lidarfiles.clouds.format_table import EXPORTS, GROUP
+from lidarlive.playback.bridge_table import BRIDGES
+from lidarlive.viewers.viewer_table import PAGE, VIEWERS
 from lidarsim.errors import LidarError
 from lidarsim.schema.vocabulary import (
     ALWAYS_COLUMNS,
@@ -21,9 +23,6 @@ from lidarsim.schema.vocabulary import (
     OPTIONAL_COLUMNS,
 )
 from lidarsim.sensor_files.format_table import FORMATS
-
-from ..playback.bridge_table import BRIDGES
-from ..viewers.viewer_table import PAGE, VIEWERS
 
 Items = list[CompletionItem]
 

@@ -101,15 +101,15 @@ def follow(
       lidarpool follow robot.urdf --sensors sensors.yaml --as ros2 --world-frame odom
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the world")
-    from ..playback.bridge import bridge_class
+    from lidarlive.playback.bridge import bridge_class
 
     bridge_class(bridge_name)  # raises an error if its packages are not installed
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarlive.following.node import FollowOptions
+    from lidarlive.following.opening import FollowSources, create_node
+    from lidarlive.following.pose_input import is_wanted
+    from lidarlive.playback.dds import Network, RosPublisher, RosSubscriber
 
-    from ..following.node import FollowOptions
-    from ..following.opening import FollowSources, create_node
-    from ..following.pose_input import is_wanted
-    from ..playback.dds import Network, RosPublisher, RosSubscriber
     from .terminal import Terminal
 
     keep_freed_memory()

@@ -108,12 +108,12 @@ def play(
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the source")
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarlive.playback.bridge import BridgeOptions, bridge_class
+    from lidarlive.playback.player import play_sweeps
+    from lidarlive.playback.schedule import Schedule
+    from lidarlive.playback.sources import open_source
     from lidarsim.packets.capture import ENDINGS
 
-    from ..playback.bridge import BridgeOptions, bridge_class
-    from ..playback.player import play_sweeps
-    from ..playback.schedule import Schedule
-    from ..playback.sources import open_source
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -153,8 +153,9 @@ def play(
 def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
-    from ..playback.pcap_recording import PcapRecording, play_recording, recorded_streams
-    from ..playback.transmitter import Transmitter
+    from lidarlive.playback.pcap_recording import PcapRecording, play_recording, recorded_streams
+    from lidarlive.playback.transmitter import Transmitter
+
     from .terminal import Terminal
 
     terminal = Terminal()

@@ -96,11 +96,11 @@ def serve(
         raise click.UsageError("Missing argument 'SCENE'.")
     print_first_step("reading the scene")
     from lidarfiles.processes.freed_memory import keep_freed_memory
+    from lidarlive.serving.messages import DEVICES
+    from lidarlive.serving.served_scene import load_served_scene
+    from lidarlive.serving.server import Endpoint, SensorServer
+    from lidarlive.serving.service import SensorService
 
-    from ..serving.messages import DEVICES
-    from ..serving.served_scene import load_served_scene
-    from ..serving.server import Endpoint, SensorServer
-    from ..serving.service import SensorService
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -121,7 +121,7 @@ def serve(
 
 
 def _write_proto(path: Path) -> None:
-    from ..serving.messages import proto_text
+    from lidarlive.serving.messages import proto_text
 
     try:
         with path.open("x", encoding="utf-8") as file:

@@ -20,6 +20,8 @@ import click
 import numpy as np
 
 from lidarfiles.picture_file import PictureContent, SensorPositions
+from lidarlive.viewers.scanner_view import ScannerView, is_present, pose_at
+from lidarlive.viewers.viewer import Address
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.environment.notebook import cell_display
@@ -42,8 +44,6 @@ from lidarview.viewer.server import (
 )
 from lidarview.viewer.view import View
 
-from ..viewers.scanner_view import ScannerView, is_present, pose_at
-from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
 SHARE = 0.02  # maximum share of a CPU core for preparing points; sending them takes as much again

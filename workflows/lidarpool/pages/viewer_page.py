@@ -30,6 +30,7 @@ from lidarfiles.clouds.shown_sweeps import (
 )
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.parts.parts import read_part
+from lidarlive.viewers.viewer import Viewer, open_viewer
 from lidarscenario.plan import best
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
@@ -40,7 +41,6 @@ from ..run.progress import Progress
 from ..run.run_page import RunPage
 from ..run.run_result import RunResult
 from ..run.store.stored_job import StoredJob
-from ..viewers.viewer import Viewer, open_viewer
 from .cpu_share import CpuShare
 
 READING_SHARE = 0.05  # maximum share of a CPU core for the surroundings and sweeps

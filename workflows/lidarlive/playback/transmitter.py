@@ -12,11 +12,11 @@ from typing import Self
 
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.packets.encoders import PacketEncoder
-from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
 from lidarsim.words import did_you_mean, join_names
 
-from .services import service_of
+from ..devices.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
+from ..devices.services import service_of
 
 # Returns the service of a sensor, as `service_of` does.
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]

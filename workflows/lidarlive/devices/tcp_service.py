@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Self
 
-from ..errors import LidarError
-from .service import Destination, Service
+from lidarsim.errors import LidarError
+from lidarsim.packets.service import Destination, Service
 
 _BACKLOG = 128  # number of connections that can wait to be accepted
 

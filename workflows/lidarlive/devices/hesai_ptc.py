@@ -18,7 +18,8 @@ from ipaddress import IPv4Address
 from struct import Struct, pack
 from zlib import crc32
 
-from .service import Destination, is_single_receiver
+from lidarsim.packets.service import Destination, is_single_receiver
+
 from .tcp_service import TcpService
 
 PTC_PORT = 9347

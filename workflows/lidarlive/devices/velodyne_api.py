@@ -14,7 +14,9 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qsl
 
-from ..environment.ports import port_number
+from lidarsim.environment.ports import port_number
+from lidarsim.packets.service import Destination
+
 from .http_service import (
     Answer,
     HttpService,
@@ -23,7 +25,6 @@ from .http_service import (
     receiver_of,
     receiver_port,
 )
-from .service import Destination
 
 _PORTS = ("dport", "tport")  # ports of data and position packets
 

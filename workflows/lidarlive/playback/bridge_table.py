@@ -14,8 +14,8 @@ class BridgeEntry(NamedTuple):
 
 # By the name that is passed to `--as`.
 BRIDGES = {
-    "packets": BridgeEntry("lidarpool.playback.live_sensor:PacketsBridge"),
-    "ros2": BridgeEntry("lidarpool.playback.ros2:Ros2Bridge", "ros2"),
-    "foxglove": BridgeEntry("lidarpool.playback.viewer_bridges:FoxgloveBridge", "live"),
-    "rerun": BridgeEntry("lidarpool.playback.viewer_bridges:RerunBridge", "rerun"),
+    "packets": BridgeEntry("lidarlive.playback.live_sensor:PacketsBridge"),
+    "ros2": BridgeEntry("lidarlive.playback.ros2:Ros2Bridge", "ros2"),
+    "foxglove": BridgeEntry("lidarlive.playback.viewer_bridges:FoxgloveBridge", "live"),
+    "rerun": BridgeEntry("lidarlive.playback.viewer_bridges:RerunBridge", "rerun"),
 }

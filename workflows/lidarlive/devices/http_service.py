@@ -19,8 +19,9 @@ from ipaddress import AddressValueError, IPv4Address
 from typing import Any, Self
 from urllib.parse import SplitResult, urlsplit
 
-from ..environment.other_sites import names_of_machine, refusal
-from .service import is_single_receiver
+from lidarsim.environment.other_sites import names_of_machine, refusal
+from lidarsim.packets.service import is_single_receiver
+
 from .tcp_service import TcpService
 
 HTTP_PORT = 80

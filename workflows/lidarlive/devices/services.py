@@ -7,15 +7,16 @@ from zlib import crc32
 
 from lidarsim.packets.encoders import PacketEncoder
 from lidarsim.packets.hesai import HesaiEncoder
-from lidarsim.packets.hesai_ptc import PtcDevice, PtcService
 from lidarsim.packets.livox import CARTESIAN, PORTS, LivoxEncoder
-from lidarsim.packets.livox_service import LivoxService, LivoxState
 from lidarsim.packets.ouster import IMU_PORT, LIDAR_PORT, OusterEncoder
-from lidarsim.packets.ouster_api import OusterApi
 from lidarsim.packets.service import Destination, Service
 from lidarsim.packets.velodyne import DATA_PORT, VelodyneEncoder
-from lidarsim.packets.velodyne_api import VelodyneApi, VelodyneState
 from lidarsim.packets.velodyne_position import POSITION_PORT
+
+from .hesai_ptc import PtcDevice, PtcService
+from .livox_service import LivoxService, LivoxState
+from .ouster_api import OusterApi
+from .velodyne_api import VelodyneApi, VelodyneState
 
 SendTo = Callable[[Destination], None]
 

@@ -17,10 +17,10 @@ class ViewerRow(NamedTuple):
 PAGE = "page"  # the live page of the run instead of a viewer
 VIEWERS = {
     "foxglove": ViewerRow(
-        "lidarpool.viewers.foxglove_server:FoxgloveServer",
+        "lidarlive.viewers.foxglove_server:FoxgloveServer",
         "foxglove",
         "foxglove-sdk",
         "live",
     ),
-    "rerun": ViewerRow("lidarpool.viewers.rerun_server:RerunServer", "rerun", "rerun-sdk", "rerun"),
+    "rerun": ViewerRow("lidarlive.viewers.rerun_server:RerunServer", "rerun", "rerun-sdk", "rerun"),
 }

@@ -14,9 +14,9 @@ import numpy as np
 from lidarsim.io.input_files import open_input
 from lidarsim.packets.capture import Capture, CapturedDatagram
 from lidarsim.packets.encoders import Datagrams
-from lidarsim.packets.ouster_api import OusterApi
 from lidarsim.packets.service import Destination, Service
 
+from ..devices.ouster_api import OusterApi
 from .schedule import Schedule
 from .transmitter import Stream, Transmitter, streams_to
 

@@ -13,12 +13,12 @@ from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import Pose, Trajectory
 from lidarsim.numerics.arrays import Ints
 from lidarsim.packets.encoders import Datagrams
-from lidarsim.packets.send import LOOPBACK, Lateness
 from lidarsim.packets.sweep_packets import Packets
 from lidarsim.schema.checks import check_number, check_type
 from lidarsim.simulator import Scanner
 from lidarsim.words import join_names
 
+from ..devices.send import LOOPBACK, Lateness
 from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 

@@ -17,13 +17,14 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from ..environment.ports import port_number
-from ..errors import LidarError
-from ..numerics.arrays import Bytes, Ints
-from ..words import shorten_name
-from .encoders import Datagrams
+from lidarsim.environment.ports import port_number
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import Bytes, Ints
+from lidarsim.packets.encoders import Datagrams
+from lidarsim.packets.service import Destination, is_single_receiver
+from lidarsim.words import shorten_name
+
 from .sender_process import DATAGRAM, END, HEADER, ROUTE
-from .service import Destination, is_single_receiver
 
 LOOPBACK = "127.0.0.1"
 _SHOWN_LETTERS = 60  # number of characters of an invalid address that are shown

@@ -20,7 +20,9 @@ from ipaddress import AddressValueError, IPv4Address
 from struct import Struct
 from typing import Self
 
-from ..errors import LidarError
+from lidarsim.errors import LidarError
+from lidarsim.packets.service import Destination, Service, is_single_receiver
+
 from .livox_commands import (
     MAX_FRAME_BYTES,
     Code,
@@ -36,7 +38,6 @@ from .livox_commands import (
     parse_values,
     push_frame,
 )
-from .service import Destination, Service, is_single_receiver
 
 SEARCH_PORT = 56_000
 _ANNOUNCE_S = 1.0  # same interval as the SDK's discovery broadcasts

@@ -14,6 +14,8 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs
 
+from lidarsim.packets.service import Destination
+
 from .http_service import (
     Answer,
     HttpService,
@@ -22,7 +24,6 @@ from .http_service import (
     receiver_of,
     receiver_port,
 )
-from .service import Destination
 
 _ROOT = "/api/v1/"
 _AUTO = "@auto"  # placeholder for the address of the client

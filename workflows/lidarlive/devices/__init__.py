@@ -1,0 +1,1 @@
+"""Network services of sensors, as their manufacturers document them."""
