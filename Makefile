@@ -80,7 +80,7 @@ lint: dev docs  ## format check, lint, types, spelling, names, layers, documenta
 	$(BIN)/codespell --builtin en-GB_to_en-US --regex '[A-Za-z][a-z]+' .ci $(SOURCES)  # identifiers
 	$(BIN)/lint-imports
 	$(BIN)/python .ci/names.py
-	$(BIN)/python .ci/planned_packages.py
+	$(BIN)/python .ci/stubs.py --check
 	$(BIN)/python .ci/lines.py
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error

@@ -7,7 +7,10 @@ import sys
 import pytest
 
 # Packages of a cluster, of clouds as files, of drawings and of the command.
-ABSENT = ("dask", "distributed", "open3d", "matplotlib", "click", "rich", "lidarpool", "lidarview")
+ABSENT = (
+    "dask", "distributed", "open3d", "matplotlib", "click", "rich", "lidarfiles", "lidarlive",
+    "lidarpool", "lidarreal", "lidarscenario", "lidarview",
+)  # fmt: skip
 
 LOADED = f"""
 import sys

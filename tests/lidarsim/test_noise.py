@@ -110,7 +110,7 @@ class Draws:
 def watch_arrays(monkeypatch, draws):
     """Have all modules draw arrays of random numbers by `draws`."""
     for name, module in [*sys.modules.items()]:
-        if name.startswith(("lidarpool", "lidarscenes", "lidarsim")):
+        if name.startswith("lidar"):
             for known, watched in ((raw, draws.raw), (scan_states, draws.states)):
                 if getattr(module, known.__name__, None) is known:
                     monkeypatch.setattr(module, known.__name__, watched)

@@ -346,7 +346,10 @@ def test_a_backend_that_the_workers_lack(cluster, refused):
 WITHOUT_LIDARPOOL = """
 import sys
 
-OURS = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
+OURS = (
+    "lidarfiles", "lidarlive", "lidarpool", "lidarreal", "lidarscenario", "lidarscenes", "lidarsim",
+    "lidarview", "poolpart", "raybeam",
+)
 
 class Absent:
     def find_spec(self, name, path=None, target=None):

@@ -24,7 +24,10 @@ import numpy as np
 from lidarsim.errors import LidarError
 
 # Code of these packages is identified by its version.
-_OWN_PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview")
+_OWN_PACKAGES = (
+    "lidarfiles", "lidarlive", "lidarpool", "lidarreal", "lidarscenario", "lidarscenes", "lidarsim",
+    "lidarview",
+)  # fmt: skip
 # Methods that dataclasses generate from the fields.
 _GENERATED = {
     "__init__", "__repr__", "__eq__", "__hash__", "__lt__", "__le__", "__gt__", "__ge__",

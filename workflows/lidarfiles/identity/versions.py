@@ -16,7 +16,10 @@ from lidarsim._version import __version__
 from lidarsim.environment.plugins import Plugin, find_plugin
 from raybeam.registry import backend_versions
 
-PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
+PACKAGES = (
+    "lidarfiles", "lidarlive", "lidarpool", "lidarreal", "lidarscenario", "lidarscenes", "lidarsim",
+    "lidarview", "poolpart", "raybeam",
+)  # fmt: skip
 # Files next to a package in a checkout, which an installed package does not contain.
 _DISTRIBUTION_FILES = ("pyproject.toml", "README.md", "LICENSE")
 IMPORTED = time.time()  # in a forked worker, the time of the import in the fork server

@@ -11,7 +11,7 @@ from lidarsim.io.allowance import memory
 from ..processes.processors import processor_count
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client as Client  # for annotations of its callers
 
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 

@@ -45,7 +45,7 @@ from .sweep_tasks import (
 from .variants import TABLE_FILE, Variants, outputs_in_table, variants_table
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from lidarfiles.work.mapping import Client
 
 _WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
 _WORKER_SWEEPS = 32  # starting a process takes about as long as augmenting this many sweeps

@@ -68,7 +68,7 @@ from .vehicle_returns import VehicleReturns
 from .visibility import estimate_visibility
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from lidarfiles.work.mapping import Client
 
 ActorSource = Literal["boxes", "clusters", "none"]
 MIN_SWEEPS = 4

@@ -37,7 +37,7 @@ from .search import CandidateSearch
 from .traffic_placements import traffic_placements
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from lidarfiles.work.mapping import Client
 
 _WORKER_BYTES = 1 << 30
 _MOUNTS = Step("mounts", (MountResult,))

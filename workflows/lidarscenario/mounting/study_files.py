@@ -29,7 +29,7 @@ from .evaluation import CONTACT_M
 from .study import MountRanking, MountStudy, figures_of, pose_entry
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from lidarfiles.work.mapping import Client
 
 SCENARIO_FILE = "best.yaml"
 PAGE_FILE = "report.html"

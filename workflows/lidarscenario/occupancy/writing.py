@@ -30,7 +30,7 @@ from ..scenario import Scenario
 from .layouts import LAYOUTS, GridLayout
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from lidarfiles.work.mapping import Client
 
 INFO_FILE = "occupancy.json"
 _TASK_SWEEPS = 4
