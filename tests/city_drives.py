@@ -9,20 +9,10 @@ from typing import Any
 import numpy as np
 from tests.simulated_drives import simulated_drive
 
-from lidarpool import (
-    Actor,
-    Cloud,
-    Mounted,
-    Pose,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    load_sensor,
-    save_cloud,
-)
+from lidarfiles import save_cloud
 from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.city import city
+from lidarsim import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, load_sensor
 from lidarsim.numerics.arrays import Floats
 
 SPEED_M_S = 4.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lidarfiles.parts.parts import StoredCloud
-from lidarpool import Cloud
 from lidarpool.report.cloud_counts import CloudCounts
+from lidarsim import Cloud
 from lidarsim.columns.cloud import CloudLike
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
-from lidarpool import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box
+from lidarsim import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

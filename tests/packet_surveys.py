@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from tests.shapes import box, wall
 
-from lidarpool import Scene
+from lidarsim import Scene
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.shots import Shots

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpool import Pose, Scanner, Scene, load_sensor
+from lidarsim import Pose, Scanner, Scene, load_sensor
 from lidarsim.scene.scene_mesh import SceneMesh
 
 HEIGHT_M = 1.9

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from lidarpool import Beams, Optics, Pose, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarsim import Beams, Optics, Pose, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.scene.colors import Colors
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lidarpool import Cloud, Scene, Survey
+from lidarsim import Cloud, Scene, Survey
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarfiles.picture_file import PictureContent, sensor_positions
-from lidarpool import Actor, Column, Scene, Sensor, Survey, Track, box
+from lidarsim import Actor, Column, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import SCAN

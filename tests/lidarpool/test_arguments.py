@@ -11,19 +11,23 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from lidarpool import (
+from lidarfiles import open_recording, save_cloud, sweeps
+from lidarlive import Foxglove, Rerun, play
+from lidarpool import Campaign, merge, remove_run, show, simulate, to_dask
+from lidarpool.run.options import RunKeywords, RunOptions
+from lidarreal import Augment, augment, compare, fit, fit_pattern, twin
+from lidarscenario import Job, Planning
+from lidarscenario.scenario import Scenario
+from lidarscenario.sections import PoolSection
+from lidarsim import (
     Actor,
-    Augment,
     Beams,
-    Campaign,
     Cloud,
     Column,
     Fault,
     Follower,
-    Foxglove,
     Gnss,
     Imu,
-    Job,
     LidarError,
     Material,
     Mounted,
@@ -33,9 +37,7 @@ from lidarpool import (
     Noise,
     Optics,
     Packets,
-    Planning,
     Pose,
-    Rerun,
     Returns,
     Scanner,
     Scene,
@@ -45,26 +47,9 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
-    augment,
     box,
-    compare,
-    fit,
-    fit_pattern,
     load_sensor,
-    merge,
-    open_recording,
-    play,
-    remove_run,
-    save_cloud,
-    show,
-    simulate,
-    sweeps,
-    to_dask,
-    twin,
 )
-from lidarpool.run.options import RunKeywords, RunOptions
-from lidarscenario.scenario import Scenario
-from lidarscenario.sections import PoolSection
 
 POINTS = np.eye(3)
 FACES = np.array([[0, 1, 2]])

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import lidarpool
+from lidarfiles import save_cloud
 from lidarfiles.clouds.boxes import Boxes, SweepBoxes
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
-from lidarpool import (
+from lidarsim import (
     Actor,
     Cloud,
     Fault,
@@ -25,7 +26,6 @@ from lidarpool import (
     Survey,
     Track,
     box,
-    save_cloud,
 )
 from lidarsim.io.storage import Storage
 from lidarsim.motion.rotations import matrices

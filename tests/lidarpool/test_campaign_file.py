@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey, load_sensor
+from lidarpool import Campaign
+from lidarscenario import Job
 from lidarscenario.campaign.campaign_file import is_campaign
 from lidarscenario.campaign.campaign_jobs import file_hashes
 from lidarscenario.campaign.campaign_sections import JobRandom
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Noise, Scene, Survey, load_sensor
 from lidarsim.sensor.models import model_names
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -13,8 +13,8 @@ import pytest
 from lidarfiles.datasets.figures import DataSetStatistics
 from lidarfiles.datasets.job_seconds import read_seconds
 from lidarfiles.datasets.job_table import JobRow
-from lidarpool import LidarError
 from lidarpool.report.campaign_report import write_card
+from lidarsim import LidarError
 from lidarsim.io.storage import Storage
 from lidarview.render.picture_page import Page
 

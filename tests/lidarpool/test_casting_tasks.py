@@ -11,10 +11,10 @@ from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F4
 from tests.lidarsim.test_rig import TURNED, survey
 
 from lidarfiles.parts.parts import pack
-from lidarpool import Scene, box
 from lidarpool.processes.shared_memory import Pickled
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
+from lidarsim import Scene, box
 from lidarsim.simulator.rig import Rig
 from poolpart.task_context import WorkerLeavingError
 

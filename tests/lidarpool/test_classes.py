@@ -16,18 +16,19 @@ from rosbags.interfaces import QosDurability
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 import lidarpool
+from lidarfiles import read_cloud
 from lidarfiles.clouds.format_table import DATA_SETS
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.picture_file import PICTURE_FILE, PictureContent
-from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.report.charts import draw_sweep
 from lidarscenario.advice import advice
 from lidarscenario.field_paths import find_field
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Material, Sensor, Survey
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.viewer.result_views import open_result

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from jsonschema import Draft7Validator
 from tests.clusters import import_jobqueue
 
-from lidarpool import LidarError
 from lidarpool.run.cluster.checks import gpu_note
 from lidarpool.run.cluster.connection import local_cluster
 from lidarpool.run.cluster.requirements import default_workers
 from lidarpool.run.cluster_file import ClusterFile
+from lidarsim import LidarError
 from poolpart import PoolError, WorkerInfo
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "clusters"

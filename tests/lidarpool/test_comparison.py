@@ -13,12 +13,14 @@ from pypcd4 import PointCloud
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
+from lidarfiles import save_cloud
 from lidarfiles.clouds.recording import RayTimes
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.figures import rank_correlation
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
+from lidarreal import compare
 from lidarreal.comparing import comparison_charts, two_clouds
+from lidarsim import Cloud, LidarError, Scene, Sensor, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 RINGS = 16

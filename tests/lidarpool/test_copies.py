@@ -8,10 +8,10 @@ import trimesh
 from tests.shapes import quad
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import LidarError, Pose, Scene, SceneMesh
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError, Pose, Scene, SceneMesh
 from lidarsim.media.materials import MaterialTable
 
 

@@ -14,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarfiles.parts.parts import part_name
-from lidarpool import LidarError, Planning
 from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase
+from lidarscenario import Planning
 from lidarscenario.plan import run_trial
+from lidarsim import LidarError
 
 SCANS = 20
 

@@ -22,7 +22,7 @@ from lidarfiles.clouds.format_table import DATA_SETS
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarfiles.datasets.job_table import JobRow
-from lidarpool import Cloud, LidarError, Scene, Sensor, Survey
+from lidarsim import Cloud, LidarError, Scene, Sensor, Survey
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

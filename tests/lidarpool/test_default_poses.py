@@ -15,7 +15,6 @@ from click.testing import CliRunner
 from tests.shapes import block, level, quad, wall
 from trimesh import creation
 
-from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
 from lidarpool.cli.commands import cli
 from lidarscenario.advice import advice
 from lidarscenario.default_poses import place_sensor, poses_around
@@ -28,6 +27,7 @@ from lidarscenes.procedural.plants import SPECIES, tree
 from lidarscenes.procedural.surroundings import PlacementChecker, is_obstructed
 from lidarscenes.procedural.terrain import terrain
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
 from lidarsim.scene.transform import Transform
 from lidarsim.simulator.rig import Rig
 

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import Scene, Sensor, Survey
 from lidarpool.run.pipeline import batches as job_state
 from lidarpool.run.pipeline import dispatch, pipeline_job, policies
 from lidarpool.run.pipeline import pipeline as driver
@@ -34,6 +33,7 @@ from lidarpool.run.pipeline.stage_messages import (
 )
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.store.database import RunDatabase
+from lidarsim import Scene, Sensor, Survey
 from lidarsim.io.storage import Storage
 from poolpart.task_locations import PartitionSnapshot
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError
 from lidarpool.pages.opened import open_view
 from lidarscenario.points.point_scene import scene_from_points
+from lidarsim import LidarError
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("pye57", reason="pye57 is an extra")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarreal.augmentation import running
+from lidarsim import LidarError
 
 VOXELS = "sequences/00/voxels/000000.bin"
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarfiles.identity.field_words import describe_changes, describe_fields
-from lidarpool import Planning
 from lidarpool.run.job_source import describe_inputs
+from lidarscenario import Planning
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarsim.words import format_rounded

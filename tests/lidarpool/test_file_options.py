@@ -6,10 +6,10 @@ from typing import get_args
 
 import pytest
 
-from lidarpool import LidarError, Scene
 from lidarscenario.campaign.campaign_jobs import ScenarioJobs
 from lidarscenario.field_paths import find_field, replace_value
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.mesh_formats import known_formats
 from lidarsim.scene.files.mesh_options import LengthUnit, MeshOptions
 from lidarsim.schema.vocabulary import UNITS_M

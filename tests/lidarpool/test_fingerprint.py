@@ -24,8 +24,8 @@ from hypothesis.extra import numpy as npst
 
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.identity.versions import PACKAGES, software, source_hash
-from lidarpool import Beams, LidarError, Sensor, Spin
 from lidarpool.identity.software import describe_difference
+from lidarsim import Beams, LidarError, Sensor, Spin
 from lidarsim.sensor import Head
 
 Pair = namedtuple("Pair", "a b")

@@ -12,29 +12,19 @@ import yaml
 from benchmarks.fit_coverage import PLACES, box, place, recorded, street, trial
 from tests.captures import IPV4, MACS, ip_packet, pcap, variants
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
-    LidarError,
-    Noise,
-    Pose,
-    Scanner,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    fit,
-    load_sensor,
-    save_cloud,
-    simulate,
-)
+from lidarpool import simulate
+from lidarreal import fit
 from lidarreal.comparing.fit import search
 from lidarreal.comparing.fit.estimates import Estimate
 from lidarreal.comparing.fit.fitting import _with_performance
 from lidarreal.comparing.fit.measured import SensorMeasurement
 from lidarreal.comparing.fit.smooth_surfaces import SmoothRays
 from lidarscenes.procedural.city import city
+from lidarsim import LidarError, Noise, Pose, Scanner, Scene, Sensor, Survey, Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.models import read_model
 from lidarsim.sweeps.sweeps import Sweeps
@@ -881,7 +871,8 @@ def test_a_kitti_sequence_is_fitted_by_the_rings_in_its_points(cluster_client, t
 
 @pytest.mark.extended
 def test_a_result_is_fitted_as_a_cloud_and_as_files(cluster_client, tmp_path):
-    from lidarpool import Scene, Survey, simulate
+    from lidarpool import simulate
+    from lidarsim import Scene, Survey
 
     survey = Survey(
         Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120), poses=[(0, 0, 0)] * 4,

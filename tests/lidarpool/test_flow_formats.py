@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_typestore
 from tests.lidarsim.test_scene_flow import SENSOR, cloud_of, straight, turning, vectors
 from tests.shapes import block
 
+from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds.kitti import flow_arrays
-from lidarpool import Mounted, Pose, Scene, Survey, read_cloud, save_cloud
-from lidarsim import Actor
+from lidarsim import Actor, Mounted, Pose, Scene, Survey
 from lidarsim import box as car_box
 from lidarsim.columns.table import FLOW, FLOW_EGO
 from lidarsim.motion.rotations import rotations_of

@@ -25,18 +25,9 @@ from lidarlive.following.node import FollowOptions
 from lidarlive.following.notices import Notices
 from lidarlive.following.opening import FollowSources, create_node
 from lidarlive.following.pose_input import is_wanted
-from lidarpool import (
-    LidarError,
-    Material,
-    Mounted,
-    Pose,
-    Scanner,
-    Scene,
-    Sensor,
-    load_sensor,
-)
 from lidarpool.cli.follow_command import follow
 from lidarscenario.sensors_file import SensorsFile
+from lidarsim import LidarError, Material, Mounted, Pose, Scanner, Scene, Sensor, load_sensor
 from lidarsim.motion.rotations import matrices
 
 DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet

@@ -23,10 +23,14 @@ from mcap_ros2.decoder import DecoderFactory
 from pypcd4.pypcd4 import PointCloud
 from tests.shapes import level, room
 
+from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds.format_table import FORMATS, load_format
 from lidarfiles.clouds.ros.layouts import LAYOUTS
 from lidarfiles.clouds.writing import ExportSpec, with_format_columns
-from lidarpool import (
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenes.procedural.city import city
+from lidarsim import (
     Beams,
     Fault,
     LidarError,
@@ -38,12 +42,7 @@ from lidarpool import (
     Survey,
     Track,
     load_sensor,
-    read_cloud,
-    save_cloud,
 )
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
-from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.io.yamlfile import load_yaml
 from lidarsim.sensor.beams import Mirror

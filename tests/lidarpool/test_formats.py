@@ -28,6 +28,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
+from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds import multi_file_format, parquet, well_known_text
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.format_table import EXPORTS, FORMATS
@@ -35,7 +36,8 @@ from lidarfiles.clouds.ros.layouts import LAYOUTS
 from lidarfiles.clouds.well_known_text import wkt
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.open3d_access.open3d_module import load_open3d
-from lidarpool import (
+from lidarpool import simulate
+from lidarsim import (
     Actor,
     Cloud,
     LidarError,
@@ -47,9 +49,6 @@ from lidarpool import (
     Track,
     box,
     load_trajectory,
-    read_cloud,
-    save_cloud,
-    simulate,
 )
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile

@@ -12,12 +12,14 @@ from tests.cloud_counting import counts_of
 from tests.committing import commit
 from tests.daemons import wait_until
 
+from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds import ply
-from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
 from lidarpool.report import growing_cloud
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
 from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore
+from lidarscenario import Job
+from lidarsim import LidarError, Scene, Sensor, Survey
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.sweeps.sweeps import Sweeps
 

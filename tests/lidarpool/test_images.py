@@ -15,7 +15,10 @@ from rosbags.typesys import Stores, get_typestore
 from tests.shapes import Cart
 
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import (
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenes.procedural.city import city
+from lidarsim import (
     Beams,
     LidarError,
     Mounted,
@@ -27,9 +30,6 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
-from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.io.yamlfile import load_yaml
 from lidarsim.schema.model_names import model_names

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarfiles.datasets.job_table import JobRow, Tally, read_table, write_table
-from lidarpool import Cloud, LidarError
+from lidarsim import Cloud, LidarError
 from lidarsim.io.storage import Storage
 
 DONE = JobRow(

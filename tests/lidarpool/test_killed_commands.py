@@ -20,11 +20,12 @@ import pytest
 from tests.kills import count_changes, is_killed
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
+from lidarfiles import save_cloud
 from lidarfiles.work import publishing, work
 from lidarfiles.work.work import FOLDER, Step
-from lidarpool import Cloud, save_cloud, twin
 from lidarpool.report import result_pictures
 from lidarpool.report.result_pictures import publish_pictures
+from lidarreal import twin
 from lidarreal.augmentation.effects import Effects
 from lidarreal.augmentation.running import Augmentation
 from lidarreal.augmentation.sweep_tasks import PartProcess, RecordingFile
@@ -37,6 +38,7 @@ from lidarscenario.mounting import pictures
 from lidarscenario.mounting.evaluation import MountEvaluator, MountResult
 from lidarscenario.mounting.study_files import rank_mounts
 from lidarscenario.occupancy import writing
+from lidarsim import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
 from lidarsim.simulator.occupancy import VoxelGrid

@@ -8,19 +8,10 @@ import numpy as np
 import pytest
 from tests.packet_surveys import points_of
 
+from lidarfiles import open_recording
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import (
-    Actor,
-    LidarError,
-    Mounted,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    box,
-    open_recording,
-)
 from lidarpool.pages.opened import open_view, open_views
+from lidarsim import Actor, LidarError, Mounted, Scene, Sensor, Survey, Track, box
 
 # Height, width, length, bottom center in camera axes (right, down, forward), and rotation_y.
 CAR = "1.5 1.8 4.2 -3 1.6 12 -1.5707963267948966"  # 12 m ahead, 3 m to the left, facing forward

@@ -10,7 +10,7 @@ from tests.shapes import room
 
 from lidarfiles.clouds.laser_scan import ScanRays, has_laser_scans, has_planar_sensors, is_planar
 from lidarfiles.clouds.writing import ExportSpec, with_format_columns
-from lidarpool import Beams, Cloud, Sensor, Spin, Survey, load_sensor
+from lidarsim import Beams, Cloud, Sensor, Spin, Survey, load_sensor
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor

@@ -16,8 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import LidarError, compare
 from lidarpool.cli.commands import cli
+from lidarreal import compare
 from lidarreal.comparing import lidar4d
 from lidarreal.comparing.lidar4d import (
     WINDOWS,
@@ -32,6 +32,7 @@ from lidarreal.reconstruction.alignment import AlignedSweep
 from lidarreal.reconstruction.held_out import HeldOutRays
 from lidarreal.reconstruction.published_metrics import HeldOutFrames
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarsim import LidarError
 from lidarsim.columns.sweep import Sweep
 
 HEIGHT, WIDTH = 66, 1030

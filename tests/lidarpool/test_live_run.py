@@ -19,7 +19,7 @@ from tests.pages import ask
 from tests.shapes import box
 
 from lidarfiles.datasets.job_table import JobRow
-from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
+from lidarpool import Campaign
 from lidarpool.pages.listed_jobs import MAX_ENDED, MAX_FAILED, MAX_UNDER_WAY
 from lidarpool.pages.live_job import LiveJob
 from lidarpool.pages.live_page import LivePage, live_page
@@ -32,6 +32,8 @@ from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.runner import cast_to_store
 from lidarpool.run.store.run_store import RunStore
+from lidarscenario import Job, Planning
+from lidarsim import Column, Scene, Sensor, Survey
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN
 from poolpart import PartitionStats

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 import lidarpool
 from lidarfiles.clouds.ros.bags import MCAP
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import Pose, Scene, Survey, load_sensor
+from lidarsim import Pose, Scene, Survey, load_sensor
 from lidarsim.sweeps.sweeps import Sweeps
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

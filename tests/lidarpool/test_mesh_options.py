@@ -9,9 +9,9 @@ from click.testing import CliRunner
 from tests.lidarpool.test_scenario import mesh_file
 
 from lidarlive.playback.sources import open_source, scenario_job
-from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarpool.pages.opened import open_view
+from lidarsim import LidarError
 
 
 @pytest.mark.parametrize("name", ["init", "check", "run", "stations", "view", "play"])

@@ -4,11 +4,12 @@ import pytest
 from click.testing import CliRunner
 
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
+from lidarreal import fit, twin
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError, Scene, box
 
 
 @pytest.fixture

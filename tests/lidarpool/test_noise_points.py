@@ -5,11 +5,12 @@ import pytest
 from click.testing import CliRunner
 
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Comparison, LidarError, Scene, compare
 from lidarpool.cli.compare_command import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.pages.opened import open_view
+from lidarreal import Comparison, compare
 from lidarscenario.points.point_scene import scene_from_points
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")

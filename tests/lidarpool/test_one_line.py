@@ -6,32 +6,26 @@ import numpy as np
 import pytest
 
 import lidarpool
-from lidarpool import (
+from lidarpool import Campaign, CampaignRun, ScanFrame
+from lidarreal import Augment, Effects, Insertion
+from lidarscenario import Job, Plan, Planning
+from lidarsim import (
     Actor,
-    Augment,
     Beams,
-    Campaign,
-    CampaignRun,
     Cloud,
     Column,
-    Effects,
     Fault,
     Follower,
     Gnss,
     Imu,
-    Insertion,
-    Job,
     Material,
     Mounted,
     Navigation,
     Noise,
     Optics,
     Packets,
-    Plan,
-    Planning,
     Pose,
     Returns,
-    ScanFrame,
     Scanner,
     Scene,
     SceneInstance,

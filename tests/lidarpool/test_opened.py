@@ -12,26 +12,16 @@ from click.testing import CliRunner
 from tests.drives import points_of, the_scene, the_sweeps, write_set
 from tests.e57_files import write_scans
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds import las
 from lidarfiles.clouds.ros import bags
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
-    LidarError,
-    Mounted,
-    Noise,
-    Pose,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    box,
-    save_cloud,
-)
 from lidarpool.cli.result_commands import view as view_command
 from lidarpool.pages import recorded
 from lidarpool.pages.job_list import JobList
 from lidarpool.pages.opened import growing_view, is_data_set, open_view, open_views
+from lidarsim import LidarError, Mounted, Noise, Pose, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

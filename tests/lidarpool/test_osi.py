@@ -11,21 +11,11 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from lidarpool import (
-    Actor,
-    LidarError,
-    Mounted,
-    Pose,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    box,
-    save_cloud,
-)
+from lidarfiles import save_cloud
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenario.traffic.osi_trace import iter_ground_truth
+from lidarsim import Actor, LidarError, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.table import SCAN
 from lidarsim.io import allowance
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -11,20 +11,11 @@ import numpy as np
 import pytest
 from tests.shapes import room
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.writing import ExportSpec, with_format_columns
-from lidarpool import (
-    Cloud,
-    LidarError,
-    Mounted,
-    Pose,
-    Scene,
-    Sensor,
-    Survey,
-    load_sensor,
-    save_cloud,
-)
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Cloud, LidarError, Mounted, Pose, Scene, Sensor, Survey, load_sensor
 from lidarsim.columns.table import SCAN, TABLE
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

@@ -7,7 +7,7 @@ import pytest
 
 from lidarfiles.parts.part_blocks import BlockMemory, read_blocks
 from lidarfiles.parts.parts import pack, read_part
-from lidarpool import LidarError
+from lidarsim import LidarError
 from lidarsim.columns.part_columns import PartColumns
 from lidarsim.columns.table import ALWAYS, SCAN, TABLE
 from lidarsim.io.storage import Storage

@@ -21,7 +21,7 @@ from lidarfiles.parts.parts import (
     read_part,
     unpack,
 )
-from lidarpool import Cloud, LidarError
+from lidarsim import Cloud, LidarError
 from lidarsim.columns.part_columns import PartColumns, cell_positions
 from lidarsim.columns.table import OPTIONAL, columns_in_parts
 from lidarsim.io.storage import Storage

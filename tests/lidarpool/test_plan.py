@@ -14,10 +14,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarError, Planning
+from lidarscenario import Planning
 from lidarscenario.plan import Trial, best, run_trial, shortest_path_length
 from lidarscenario.plan.cost import PathCost
 from lidarscenario.plan.geometry import clearance, segment_distances
+from lidarsim import LidarError
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
 DEFAULT = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0)

@@ -14,7 +14,6 @@ import shapely
 from tests.shapes import level, quad
 from tests.simulated_drives import simulated_points
 
-from lidarpool import LidarError, Mounted, Scene, Survey, Track, load_sensor
 from lidarscenario.plan.flight import plan_flight
 from lidarscenario.plan.flight_area import read_area, transform_shape, utm_epsg
 from lidarscenario.plan.flight_density import (
@@ -28,6 +27,7 @@ from lidarscenario.plan.flight_files import to_geojson, to_kml
 from lidarscenario.plan.flight_lines import Terrain
 from lidarscenario.plan.flight_path import FlightLeg, fly, shortest_turn, turn_radius_m
 from lidarscenario.plan.flight_scanner import AirborneScanner
+from lidarsim import LidarError, Mounted, Scene, Survey, Track, load_sensor
 
 SQUARE = shapely.box(0, 0, 1000, 1000)
 RIEGL = "airborne/riegl-vq780i"  # 60°, 666,600 pulses per second on average, 20 to 300 Hz

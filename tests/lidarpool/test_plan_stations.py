@@ -8,7 +8,6 @@ import pytest
 from click.testing import CliRunner
 from tests.shapes import block, level, quad, wall
 
-from lidarpool import LidarError, Scene, SceneMesh, Sensor, box, load_sensor
 from lidarpool.cli.commands import cli
 from lidarscenario.plan.stations import (
     StationVisibility,
@@ -18,6 +17,7 @@ from lidarscenario.plan.stations import (
     survey_coverage,
 )
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError, Scene, SceneMesh, Sensor, box, load_sensor
 from raybeam import RayCaster
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)

@@ -12,7 +12,6 @@ import yaml
 from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
-from lidarpool import Scanner, Scene, SceneMesh, load_sensor
 from lidarscenario.campaign.campaign import CampaignSpec
 from lidarscenario.campaign.campaign_file import is_campaign
 from lidarscenario.plausibility import plausibility_warnings
@@ -21,6 +20,7 @@ from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.paint import paint_scene
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Scanner, Scene, SceneMesh, load_sensor
 from raybeam import RayCaster
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

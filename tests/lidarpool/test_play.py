@@ -17,8 +17,8 @@ from lidarlive.playback.bridge import Bridge
 from lidarlive.playback.bridge_table import BRIDGES, BridgeEntry
 from lidarlive.playback.schedule import Prefetcher
 from lidarlive.playback.sources import open_source
-from lidarpool import LidarError
 from lidarpool.cli.commands import cli
+from lidarsim import LidarError
 
 SCENARIO = """
 sensor: {model: velodyne/vlp16, rate_hz: 20}

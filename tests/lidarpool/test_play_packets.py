@@ -23,12 +23,15 @@ import pytest
 from click.testing import CliRunner
 from tests.shapes import room
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.writing import ExportSpec
+from lidarlive import play
 from lidarlive.playback.live_sensor import RepeatedInstruments
 from lidarlive.playback.pcap_recording import PcapRecording
 from lidarlive.playback.sources import open_source, scenario_job
 from lidarlive.playback.transmitter import Transmitter, sensor_streams
-from lidarpool import (
+from lidarpool.cli.commands import cli
+from lidarsim import (
     Cloud,
     LidarError,
     Mounted,
@@ -39,10 +42,7 @@ from lidarpool import (
     Scene,
     Track,
     load_sensor,
-    play,
-    save_cloud,
 )
-from lidarpool.cli.commands import cli
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.simulator.points.batch_columns import columns_of

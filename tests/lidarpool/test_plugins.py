@@ -8,11 +8,11 @@ import pytest
 from tests.meshes import write
 from tests.plugin_files import write_distribution
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.format_table import format_row
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.identity.versions import plugin_versions, software
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.identity.software import describe_difference
 from lidarscenario.campaign.campaign_jobs import file_hashes
@@ -20,6 +20,7 @@ from lidarscenario.points.point_files import read_points
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenario.schema import scenario_schema
+from lidarsim import Cloud, LidarError, Scene, load_sensor
 from lidarsim.environment.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
 

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from tests.drives import the_scene, the_sweeps
 
+from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds import ply
 from lidarfiles.open3d_access.open3d_module import load_open3d
-from lidarpool import Cloud, Column, LidarError, read_cloud, save_cloud
+from lidarsim import Cloud, Column, LidarError
 from lidarsim.sweeps.sweeps import Sweeps
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lidarfiles.clouds.ply_rows import PlyRowEncoder
 from lidarfiles.parts.part_blocks import BlockMemory
-from lidarpool import Column, LidarError
+from lidarsim import Column, LidarError
 from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.ply_format import as_file_type, row_type
 from lidarsim.columns.table import AXES, OPTIONAL, SCAN, TABLE

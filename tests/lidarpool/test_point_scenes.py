@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles import save_cloud
 from lidarfiles.open3d_access.open3d_module import load_open3d
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import open_view
 from lidarscenario.points.point_scene import scene_from_points
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor
 from lidarsim.scene.files.pcd import pcd_bytes
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T

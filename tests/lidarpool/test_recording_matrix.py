@@ -10,22 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidarfiles import open_recording, save_cloud
 from lidarfiles.recordings.opening import open_sensors
-from lidarpool import (
-    Material,
-    Scene,
-    Survey,
-    Track,
-    box,
-    compare,
-    load_sensor,
-    open_recording,
-    save_cloud,
-)
 from lidarpool.pages.recorded import recorded_view
+from lidarreal import compare
 from lidarreal.comparing.fit.stack import SweepStack
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarscenario.points.point_files import read_points
+from lidarsim import Material, Scene, Survey, Track, box, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -17,14 +17,15 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, compare, load_trajectory, twin
 from lidarpool.pages.opened import open_view
+from lidarreal import compare, twin
 from lidarreal.comparing.fit.stack import SweepStack
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
 from lidarreal.reconstruction.motion import Motion
 from lidarreal.reconstruction.odometry import RecordedPoses, find_poses
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarsim import LidarError, load_trajectory
 from lidarsim.columns.bags import POINT_CLOUD
 from lidarsim.io.archives import pack_arrays
 from lidarsim.scene.files.pcd import pcd_bytes

@@ -17,20 +17,7 @@ from lxml import html
 from PIL import Image
 from tests.cloud_counting import counts_of
 
-from lidarpool import (
-    Cloud,
-    Mounted,
-    Noise,
-    Planning,
-    Result,
-    Returns,
-    Scene,
-    SceneMesh,
-    Sensor,
-    Survey,
-    Track,
-    load_sensor,
-)
+from lidarpool import Result
 from lidarpool.report.page.rendering import (
     MAX_ROWS,
     draw_top_view,
@@ -42,9 +29,22 @@ from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SOR
 from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.planning_trials import TRIAL
+from lidarscenario import Planning
 from lidarscenario.plan import best
 from lidarscenario.plan.trial import run_trial
 from lidarscenario.scenario import Scenario
+from lidarsim import (
+    Cloud,
+    Mounted,
+    Noise,
+    Returns,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    Track,
+    load_sensor,
+)
 from lidarview.page_templates import sentence
 
 EVIL = (

@@ -22,9 +22,9 @@ from tests.shapes import room
 from lidarfiles.clouds.ros.messages import RosMessage, message_store
 from lidarlive.playback.bridge import BridgeOptions, bridge_class
 from lidarlive.playback.schedule import Schedule
-from lidarpool import Cloud, LidarError, Sensor, Survey
 from lidarpool.cli.play_command import play
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Cloud, LidarError, Sensor, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet

@@ -18,6 +18,7 @@ from rosbags.typesys.store import Typestore
 from tests.drives import points_of, the_scene, the_survey
 from tests.shapes import room
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.format_table import LAYOUTS
 from lidarfiles.clouds.ros import layouts
 from lidarfiles.clouds.ros.bags import header_of
@@ -25,18 +26,8 @@ from lidarfiles.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
 from lidarfiles.clouds.ros.organized import organized_rows
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
-    Cloud,
-    LidarError,
-    Mounted,
-    Returns,
-    Sensor,
-    Survey,
-    Track,
-    load_sensor,
-    save_cloud,
-)
 from lidarpool.cli.result_commands import export
+from lidarsim import Cloud, LidarError, Mounted, Returns, Sensor, Survey, Track, load_sensor
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import COLORS, SCAN
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -18,10 +18,11 @@ from rerun.chunk import RrdReader
 from tests.lidarpool.test_viewers import ROOM
 from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.writing import ExportSpec
 from lidarlive.playback.sources import open_source
-from lidarpool import Cloud, LidarError, save_cloud
+from lidarsim import Cloud, LidarError
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
 

@@ -10,18 +10,9 @@ from benchmarks.fit_coverage import box
 from click.testing import CliRunner
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import (
-    LidarError,
-    Noise,
-    Scanner,
-    Scene,
-    Sensor,
-    Spin,
-    Track,
-    fit_pattern,
-    load_sensor,
-)
 from lidarpool.cli.commands import cli
+from lidarreal import fit_pattern
+from lidarsim import LidarError, Noise, Scanner, Scene, Sensor, Spin, Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.export import fired_rays
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from tests.pages import ask
 
-from lidarpool import Actor, LidarError, Mounted, Pose, Scanner, Scene, Sensor, Track, box, show
+from lidarpool import show
+from lidarsim import Actor, LidarError, Mounted, Pose, Scanner, Scene, Sensor, Track, box
 
 SCRIPT = """
 from lidarpool import Pose, Scanner, Scene, Sensor, show

@@ -15,23 +15,13 @@ from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import (
-    Job,
-    LidarError,
-    Noise,
-    Pose,
-    Returns,
-    Scene,
-    SceneInstance,
-    Sensor,
-    Survey,
-    box,
-)
+from lidarscenario import Job
 from lidarscenario.advice import advice
 from lidarscenario.demo import demo_scenario
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenario.static_scene import SceneCache
+from lidarsim import LidarError, Noise, Pose, Returns, Scene, SceneInstance, Sensor, Survey, box
 from lidarsim.media.materials import MaterialTable, SurfaceKinds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -12,7 +12,6 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import LidarError
 from lidarscenario.campaign.campaign import CampaignSpec
 from lidarscenario.campaign.campaign_file import is_campaign
 from lidarscenario.prepare import prepare
@@ -24,6 +23,7 @@ from lidarscenario.schema import (
     schema_text,
     short_scenario,
 )
+from lidarsim import LidarError
 from lidarsim.schema.section_fields import fields_of, is_section
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))

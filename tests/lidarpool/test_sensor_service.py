@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scanner, Track, load_sensor
 from lidarpool.cli.commands import cli
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Material, Mounted, Noise, Pose, Scanner, Track, load_sensor
 from lidarsim.motion.rotations import quaternions_of
 
 grpc = pytest.importorskip("grpc")

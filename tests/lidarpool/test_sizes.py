@@ -14,7 +14,7 @@ from tests.drives import the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, load_trajectory
+from lidarsim import LidarError, load_trajectory
 from lidarsim.columns.bags import livox_columns
 from lidarsim.io import allowance
 

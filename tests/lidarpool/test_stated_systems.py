@@ -9,13 +9,14 @@ import pytest
 from click.testing import CliRunner
 
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import growing_view, open_view
+from lidarreal import compare
 from lidarscenario.points.point_scene import scene_from_points
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files import coordinate_systems
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")

@@ -18,10 +18,12 @@ import lidarpool.run.store.remote
 import lidarpool.run.store.run_store
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.parts.parts import mark_name, part_name, probe_name
-from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey, remove_run
+from lidarpool import Campaign, remove_run
 from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore
+from lidarscenario import Job, Planning
 from lidarscenario.plan import run_trial
+from lidarsim import LidarError, Scene, Sensor, Survey
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 

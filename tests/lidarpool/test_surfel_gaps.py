@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import Pose, Scanner, Scene, Sensor, box
 from lidarpool.cli.scenario_commands import scene as command
 from lidarscenario.points.point_scene import points_to_scene
 from lidarscenario.points.surfel_gaps import expected_loss
+from lidarsim import Pose, Scanner, Scene, Sensor, box
 
 pytest.importorskip("open3d", reason="Open3D does not exist")
 

@@ -15,21 +15,12 @@ import trimesh
 from click.testing import CliRunner
 from rasterio.crs import CRS
 
-from lidarpool import (
-    Cloud,
-    LidarError,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-    compare,
-    compare_strips,
-    compare_surveys,
-    open_recording,
-)
+from lidarfiles import open_recording
 from lidarpool.cli.commands import cli
+from lidarreal import compare, compare_strips, compare_surveys
 from lidarreal.comparing.surveys import pairs, planes
 from lidarreal.comparing.surveys.survey_charts import draw_facades
+from lidarsim import Cloud, LidarError, Scene, Sensor, Survey, Track
 from lidarsim.sweeps.sweeps import Sweeps
 
 ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lidarpool import SceneMesh
 from lidarreal.comparing.fit.smooth_surfaces import find_surfaces
 from lidarreal.reconstruction.alignment import Alignment
 from lidarreal.reconstruction.free_space import RangeImage
@@ -17,6 +16,7 @@ from lidarreal.reconstruction.odometry import RecordedPoses
 from lidarreal.reconstruction.porosity import Porosity
 from lidarreal.scan_patterns.lasers import RingLasers
 from lidarscenario.points.point_scene import CLASS_MATERIAL, surfel_faces
+from lidarsim import SceneMesh
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials
 

@@ -27,7 +27,8 @@ from lidarfiles.clouds.format_table import DATA_SETS, LAYOUTS, load_format
 from lidarfiles.datasets.dataset import INDEX_FILE, DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, Scene, Sweep
+from lidarsim import LidarError, Scene
+from lidarsim.columns.sweep import Sweep
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -11,25 +11,14 @@ import numpy as np
 import pytest
 from tests.shapes import cast_between, made
 
+from lidarfiles import save_cloud
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.picture_file import PictureContent
-from lidarpool import (
-    Actor,
-    Cloud,
-    LidarError,
-    Mounted,
-    Pose,
-    Scene,
-    Survey,
-    Track,
-    box,
-    load_sensor,
-    save_cloud,
-)
 from lidarpool.report.picture_content import picture_content
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Actor, Cloud, LidarError, Mounted, Pose, Scene, Survey, Track, box, load_sensor
 from lidarsim.casting.surfaces import SceneSurfaces
 from lidarsim.io import allowance
 from lidarsim.simulator.rig import Rig

@@ -14,11 +14,23 @@ from click.testing import CliRunner
 from scipy.spatial import cKDTree
 from tests.simulated_drives import simulated_drive, simulated_points
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.point_times import PointTimes
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.rings import Rings
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
+from lidarpool.cli.commands import cli
+from lidarreal import twin
+from lidarreal.reconstruction.alignment import Alignment
+from lidarreal.reconstruction.lost_pulses import SensorCoverage, lost_pulses
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.scan_patterns.lasers import RingLasers
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenes.procedural.city import city
+from lidarsim import (
     Actor,
     LidarError,
     Material,
@@ -31,19 +43,7 @@ from lidarpool import (
     Track,
     box,
     load_sensor,
-    save_cloud,
-    twin,
 )
-from lidarpool.cli.commands import cli
-from lidarreal.reconstruction.alignment import Alignment
-from lidarreal.reconstruction.lost_pulses import SensorCoverage, lost_pulses
-from lidarreal.reconstruction.motion import Motion
-from lidarreal.reconstruction.odometry import find_poses
-from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarreal.scan_patterns.lasers import RingLasers
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
-from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.colors import LINEAR

@@ -9,15 +9,17 @@ import pytest
 from tests.city_drives import CARS, car_drive, car_position
 from tests.drives import points_of, the_scene, the_survey
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.recorded_boxes import RecordedBoxes
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, save_cloud, twin
+from lidarreal import twin
 from lidarreal.reconstruction.moving_objects import find_tracks
 from lidarreal.reconstruction.moving_rays import MovingRays, SweepMasks
 from lidarreal.reconstruction.object_clusters import find_clusters
 from lidarreal.reconstruction.object_surfels import cast_to_objects, reconstruct_objects
 from lidarreal.reconstruction.object_tracks import ObjectTrack
+from lidarsim import LidarError
 from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.sweeps.sweeps import Sweeps
 

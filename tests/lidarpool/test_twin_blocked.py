@@ -9,12 +9,14 @@ import pytest
 import yaml
 from tests.lidarpool.test_twin import city_drive
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Track, load_sensor, save_cloud, twin
+from lidarreal import twin
 from lidarreal.reconstruction.blocked_directions import PulseCounts, separated_sweeps
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarsim import Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("scipy")

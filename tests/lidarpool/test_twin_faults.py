@@ -22,9 +22,10 @@ from lidarfiles.clouds.folder import result_folder
 from lidarfiles.work.lost_workers import LostWorkersError
 from lidarfiles.work.mapping import parallel_map
 from lidarfiles.work.work import FOLDER
-from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
+from lidarreal import twin
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarsim import LidarError, Sensor
 
 pytest.importorskip("scipy")
 

@@ -12,7 +12,7 @@ from tests.simulated_drives import simulated_drive
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Beams, Mounted, Pose, Sensor, Survey, load_sensor, twin
+from lidarreal import twin
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarreal.reconstruction.free_space import RangeImage
 from lidarreal.reconstruction.lost_pulses import SensorCoverage, lost_pulses
@@ -21,6 +21,7 @@ from lidarreal.reconstruction.odometry import RecordedPoses
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarreal.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
+from lidarsim import Beams, Mounted, Pose, Sensor, Survey, load_sensor
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("scipy")

@@ -11,7 +11,7 @@ from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_la
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import Sensor, load_sensor, twin
+from lidarreal import twin
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, align
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
 from lidarreal.reconstruction.motion import Motion
@@ -21,6 +21,7 @@ from lidarreal.reconstruction.recorded_sensor import SweepTiming
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarreal.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
+from lidarsim import Sensor, load_sensor
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("scipy")

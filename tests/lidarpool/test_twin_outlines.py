@@ -10,23 +10,13 @@ import yaml
 from tests.shapes import wall
 from tests.simulated_drives import simulated_points
 
-from lidarpool import (
-    Mounted,
-    Noise,
-    Pose,
-    Returns,
-    Scene,
-    SceneMesh,
-    Survey,
-    Track,
-    load_sensor,
-    twin,
-)
+from lidarreal import twin
 from lidarreal.reconstruction.outlines import Extents, crossed_cells
 from lidarreal.reconstruction.porosity import Crossings
 from lidarreal.reconstruction.surfels import Surfels, surfel_mesh
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Mounted, Noise, Pose, Returns, Scene, SceneMesh, Survey, Track, load_sensor
 from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")

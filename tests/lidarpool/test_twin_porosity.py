@@ -8,10 +8,11 @@ import yaml
 from tests.shapes import wall
 from tests.simulated_drives import simulated_drive, simulated_points
 
-from lidarpool import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, twin
+from lidarreal import twin
 from lidarreal.reconstruction.porosity import Crossings, Porosity
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track
 
 pytest.importorskip("scipy")
 

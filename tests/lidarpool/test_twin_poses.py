@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import LidarError
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarreal.reconstruction.blocked_directions import BlockedDirections
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
@@ -18,6 +17,7 @@ from lidarreal.reconstruction.odometry import RecordedPoses, find_poses
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarreal.reconstruction.voxel_planes import VoxelPlanes, cell_keys, smallest_by_cell
 from lidarreal.scan_patterns.lasers import RingLasers
+from lidarsim import LidarError
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("small_gicp")

@@ -10,21 +10,10 @@ import pytest
 from tests.shapes import wall
 from tests.simulated_drives import simulated_drive
 
-from lidarpool import (
-    Actor,
-    Material,
-    Mounted,
-    Pose,
-    Scene,
-    SceneMesh,
-    Sensor,
-    Survey,
-    Track,
-    box,
-    twin,
-)
+from lidarreal import twin
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Actor, Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, box
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.extended

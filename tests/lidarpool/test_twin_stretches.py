@@ -17,11 +17,12 @@ from distributed import Client
 from tests.city_drives import write_city_drive
 
 import poolpart.deploy
-from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
+from lidarreal import twin
 from lidarreal.reconstruction.alignment import Alignment
 from lidarreal.reconstruction.motion import Motion, MotionStep
 from lidarreal.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
+from lidarsim import LidarError, Sensor
 
 pytest.importorskip("scipy")
 

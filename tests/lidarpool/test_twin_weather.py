@@ -9,7 +9,16 @@ import pytest
 from tests.simulated_drives import simulated_drive
 
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
+from lidarreal import twin
+from lidarreal.reconstruction.air_returns import find_air_returns
+from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
+from lidarreal.reconstruction.isolated_returns import IsolatedRanges, same_range_neighbors
+from lidarreal.reconstruction.lost_pulses import SensorCoverage
+from lidarreal.reconstruction.motion import Motion
+from lidarreal.reconstruction.odometry import find_poses
+from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarreal.reconstruction.vehicle_detection import find_vehicle_returns
+from lidarsim import (
     Actor,
     Material,
     Mounted,
@@ -22,16 +31,7 @@ from lidarpool import (
     Survey,
     Track,
     box,
-    twin,
 )
-from lidarreal.reconstruction.air_returns import find_air_returns
-from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
-from lidarreal.reconstruction.isolated_returns import IsolatedRanges, same_range_neighbors
-from lidarreal.reconstruction.lost_pulses import SensorCoverage
-from lidarreal.reconstruction.motion import Motion
-from lidarreal.reconstruction.odometry import find_poses
-from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarreal.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 

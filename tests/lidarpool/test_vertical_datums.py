@@ -7,12 +7,13 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, compare_strips, compare_surveys
 from lidarpool.cli.commands import cli
+from lidarreal import compare_strips, compare_surveys
 from lidarscenario.points.point_scene import scene_from_points
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.scene import Scene
 

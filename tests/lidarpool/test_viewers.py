@@ -19,19 +19,20 @@ from tests.foxglove_client import FoxgloveClient, numbers, records, stamp_ns
 
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.clouds.shown_sweeps import ShownSweep, Surroundings
+from lidarlive import Foxglove, Rerun
 from lidarlive.playback.bridge import BridgeOptions, bridge_class
 from lidarlive.playback.schedule import Schedule
 from lidarlive.playback.sources import open_source
 from lidarlive.viewers import attached_child
 from lidarlive.viewers.viewer import Address, Viewer, open_viewer
-from lidarpool import (
+from lidarpool import simulate
+from lidarpool.cli.commands import cli
+from lidarscenario import Planning
+from lidarsim import (
     Actor,
-    Foxglove,
     LidarError,
     Mounted,
-    Planning,
     Pose,
-    Rerun,
     Scanner,
     Scene,
     Sensor,
@@ -39,9 +40,7 @@ from lidarpool import (
     Track,
     box,
     load_sensor,
-    simulate,
 )
-from lidarpool.cli.commands import cli
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 

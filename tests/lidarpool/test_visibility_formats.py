@@ -13,11 +13,12 @@ from rosbags.typesys import Stores, get_typestore
 from tests.lidarsim.test_actor_visibility import MOUNT, SENSOR, street
 from tests.lidarsim.test_scene_flow import turning
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.boxes import Boxes, summarize_boxes
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, read_table, write_table
 from lidarfiles.datasets.loader import sweeps as data_set_sweeps
-from lidarpool import Mounted, Survey, save_cloud
+from lidarsim import Mounted, Survey
 from lidarsim.columns.table import SCAN
 from lidarsim.io.storage import Storage
 from lidarsim.simulator.points.batch_columns import columns_of

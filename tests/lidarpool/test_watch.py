@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool import LidarError
 from lidarpool.run.cluster import watch
 from lidarpool.run.cluster.watch import Watch
+from lidarsim import LidarError
 from poolpart.task_locations import PartitionSnapshot
 
 

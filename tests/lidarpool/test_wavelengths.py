@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lidarpool import Sensor, load_sensor
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import Sensor, load_sensor
 from lidarsim.sensor.export import fired_rays
 from lidarsim.sensor.optics import Optics
 

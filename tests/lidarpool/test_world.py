@@ -13,9 +13,9 @@ import yaml
 from click.testing import CliRunner
 from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
 
+from lidarfiles import read_cloud
 from lidarfiles.clouds.las_header import las_system
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.pages.preview import first_sweeps
 from lidarscenario.advice import advice
@@ -23,6 +23,7 @@ from lidarscenario.empty_cloud import empty_cloud_reason
 from lidarscenario.plausibility import plausibility_warnings
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.stated_system import StatedSystem
 
 ORIGIN = [500_000, 5_400_000]

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import pytest
 
 from lidarfiles.datasets.dataset import DataSet
-from lidarpool import Scene, Sensor, Survey
 from lidarpool.run import writer
 from lidarpool.run.cluster.checks import check_workers
 from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.writer import MAX_JOBS_PER_TASK, DataSetWriter
+from lidarsim import Scene, Sensor, Survey
 from lidarsim.io.storage import Storage
 
 

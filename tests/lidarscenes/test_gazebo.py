@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from PIL import Image
 from tests.lidarscenes.test_robots import DAE
 
-from lidarpool import LidarError, Scene, load_sensor
 from lidarpool.cli.scenario_commands import import_
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Scene, load_sensor
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

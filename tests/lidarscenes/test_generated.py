@@ -10,13 +10,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarError
 from lidarscenes.procedural.cars import MODELS, all_cars
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.city_kinds import all_kinds
 from lidarscenes.procedural.plants import SCALES, SPECIES, tree
 from lidarscenes.procedural.terrain import terrain
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError
 from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 from raybeam import RayCaster

@@ -11,12 +11,12 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
 from lidarscenario.points.point_scene import surfel_mesh
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.helios import ImportedSurvey, import_survey
+from lidarsim import LidarError
 from lidarsim.media.materials import MaterialTable
 from lidarsim.simulator.rig import Rig
 from raybeam import RayCaster

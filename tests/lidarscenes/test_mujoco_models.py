@@ -14,13 +14,12 @@ from click.testing import CliRunner
 from PIL import Image
 from tests.fork_server import ForkServer
 
-from lidarpool import LidarError, MujocoScanner, Scanner, Scene, Sensor
 from lidarpool.cli.scenario_commands import import_
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.mujoco import model_file
-from lidarsim import SceneInstance
+from lidarsim import LidarError, MujocoScanner, Scanner, Scene, SceneInstance, Sensor
 from lidarsim.io import allowance
 from lidarsim.scene.files.meshfile import load_objects
 

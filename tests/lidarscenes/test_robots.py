@@ -12,11 +12,11 @@ from tests.lidarsim.test_moving import stored_positions
 from tests.shapes import level, made
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import LidarError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
-from lidarsim import Mounted, box
+from lidarscenes import load_robot
+from lidarsim import LidarError, Mounted, Pose, Scene, Survey, Track, box, load_sensor
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig

@@ -11,11 +11,10 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 
-from lidarpool import LidarError, Scene
 from lidarpool.cli.scenario_commands import scene as command
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim import SceneInstance, box
+from lidarsim import LidarError, Scene, SceneInstance, box
 from lidarsim.scene.colors import WHITE, Colors
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import Cutout

@@ -17,12 +17,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from tests.fork_server import USD_CORE, ForkServer
 
-from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
-from lidarsim import LidarError, SceneInstance
+from lidarsim import LidarError, Pose, Scanner, Scene, SceneInstance, Sensor
 from lidarsim.columns.table import COLORS
 from lidarsim.io import allowance
 from lidarsim.scene.colors import LINEAR, as_srgb

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarpool import Noise
+from lidarsim import Noise
 from lidarsim.media.weather import Air, Particles
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.random_numbers import Purpose, quantiles

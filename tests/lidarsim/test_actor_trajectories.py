@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Pose, Track
+from lidarsim import LidarError, Pose, Track
 from lidarsim.casting.actor_trajectories import ActorTrajectories
 from lidarsim.motion.trajectory import Stations
 

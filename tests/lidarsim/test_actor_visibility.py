@@ -10,8 +10,7 @@ import pytest
 from tests.lidarsim.test_scene_flow import straight, turning
 from tests.shapes import block, level, wall
 
-from lidarpool import Mounted, Pose, Scene, Sensor, Survey, load_sensor
-from lidarsim import Actor, box
+from lidarsim import Actor, Mounted, Pose, Scene, Sensor, Survey, box, load_sensor
 from lidarsim.casting.actor_visibility import FieldOfView
 from lidarsim.columns.actor_rays import merge_actor_rays
 from lidarsim.motion.trajectory import full_poses

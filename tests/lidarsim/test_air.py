@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.shapes import box, made, quad, wall
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -19,12 +19,12 @@ from lidarpool import (
     Optics,
     Returns,
     Scene,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
 )
-from lidarsim import SceneMesh
 from lidarsim import box as cuboid
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import extinction

@@ -10,13 +10,25 @@ import pytest
 from tests.meshes import write
 from tests.shapes import made
 
+from lidarfiles import save_cloud
 from lidarfiles.clouds.boxes import Boxes
 from lidarfiles.picture_file import PictureContent
-from lidarpool import Actor, LidarError, Material, Scanner, Scene, Sensor, Survey, Track, save_cloud
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
-from lidarsim import Cloud, SceneMesh, box
+from lidarsim import (
+    Actor,
+    Cloud,
+    LidarError,
+    Material,
+    Scanner,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    Track,
+    box,
+)
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import distinct_meshes, join_meshes
 from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation

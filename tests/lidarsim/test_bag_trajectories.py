@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Pose, Track, load_trajectory
+from lidarsim import LidarError, Pose, Track, load_trajectory
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from tests.shapes import Cart, cast, quad, solid, wall
 
-from lidarpool import (
+from lidarsim import (
     Beams,
     LidarError,
     Material,
@@ -18,12 +18,12 @@ from lidarpool import (
     Pose,
     Returns,
     Scene,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     load_sensor,
 )
-from lidarsim import SceneMesh
 from lidarsim.sensor.disc import SUBRAYS, Beam
 from lidarsim.sensor.ray_sensors import PrismSensor
 from lidarsim.sensor.sensor import LineSensor

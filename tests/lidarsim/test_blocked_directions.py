@@ -9,7 +9,7 @@ import pytest
 import yaml
 from tests.shapes import block
 
-from lidarpool import (
+from lidarsim import (
     Beams,
     Fault,
     LidarError,
@@ -18,9 +18,9 @@ from lidarpool import (
     Sensor,
     Spin,
     Survey,
+    export_sensor,
     load_sensor,
 )
-from lidarsim import export_sensor
 from lidarsim.sensor.plain_data import from_plain_data, to_plain_data
 from lidarsim.sensor.ray_sensors import ListedSensor, PrismSensor
 from lidarsim.simulator.points.batch_columns import columns_of

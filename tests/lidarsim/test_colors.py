@@ -21,7 +21,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_color
 from trimesh.visual.material import PBRMaterial
 
-from lidarpool import (
+from lidarscenario.scenario import Scenario
+from lidarsim import (
     Actor,
     Column,
     LidarError,
@@ -36,7 +37,6 @@ from lidarpool import (
     Sensor,
     Track,
 )
-from lidarscenario.scenario import Scenario
 from lidarsim.columns.table import COLORS
 from lidarsim.media.materials import DARKEST, reflectances
 from lidarsim.scene import masks

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool import (
+from lidarfiles import save_cloud
+from lidarpool import simulate
+from lidarsim import (
     Cloud,
     Column,
     Fault,
@@ -26,8 +28,6 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
-    save_cloud,
-    simulate,
 )
 from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, columns_in_parts, optional_columns
 from lidarsim.simulator.points.batch_points import BatchPoints

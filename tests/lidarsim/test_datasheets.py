@@ -11,11 +11,11 @@ import yaml
 from click.testing import CliRunner
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarError, Material, Mounted, Noise, Returns, Survey, load_sensor
 from lidarpool.cli.scenario_commands import sensors
 from lidarscenario.advice import advice
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Material, Mounted, Noise, Returns, Survey, load_sensor
 from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import Detection, read_model
 

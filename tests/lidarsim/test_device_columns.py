@@ -18,19 +18,22 @@ from tests.shapes import BALL_AROUND as SPHERE
 from tests.shapes import SPIN_OF_128_BEAMS as MANY
 from tests.shapes import cast_between
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Column,
+    Material,
     Mounted,
     Noise,
     Pose,
+    Returns,
     Scanner,
     Scene,
     SceneInstance,
     Survey,
     Track,
+    box,
+    load_sensor,
 )
-from lidarsim import Material, Returns, box, load_sensor
 from lidarsim.motion.trajectory import Stations
 from lidarsim.scene.colors import Colors
 from lidarsim.scene.shapes import seed_objects

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from tests.shapes import Cart, block, cast_between, wall
 
-from lidarpool import (
+from lidarscenes.robots.robot import Hinge, LinkPath
+from lidarsim import (
+    Actor,
     Material,
     Mounted,
     Noise,
@@ -18,10 +20,9 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     load_sensor,
 )
-from lidarscenes.robots.robot import Hinge, LinkPath
-from lidarsim import Actor, box
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Stations, velocities
 from lidarsim.pulses.returns import PulseReturns

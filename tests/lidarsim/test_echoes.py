@@ -23,7 +23,7 @@ from tests.shapes import (
     wall,
 )
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -32,12 +32,12 @@ from lidarpool import (
     Pose,
     Returns,
     Scene,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
 )
-from lidarsim import SceneMesh
 from lidarsim import box as cuboid
 from lidarsim.media.materials import extinction, fresnel
 from lidarsim.numerics.random_numbers import raw

@@ -13,24 +13,13 @@ import pytest
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
 from tests.shapes import ball, beam_along_x, block, level, quad, wall
 
-from lidarpool import (
-    Actor,
-    LidarError,
-    Material,
-    Noise,
-    Scene,
-    SceneInstance,
-    Sensor,
-    Survey,
-    Track,
-    load_robot,
-    read_cloud,
-    save_cloud,
-    simulate,
-)
+from lidarfiles import read_cloud, save_cloud
+from lidarpool import simulate
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarscenes import load_robot
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Actor, LidarError, Material, Noise, Scene, SceneInstance, Sensor, Survey, Track
 from lidarsim.columns.table import SCAN
 from lidarsim.pulses.steps.stray_light import BLOOMING
 from lidarsim.scene.actors import join_meshes

@@ -19,8 +19,12 @@ from lidarfiles.clouds.webdataset import WebDataset
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.datasets.sweep_data import sweep_of_job
-from lidarpool import (
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarsim import (
     Actor,
+    Cloud,
     Fault,
     LidarError,
     Mounted,
@@ -33,10 +37,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarscenario.campaign.campaign import CampaignSpec
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
-from lidarsim import Cloud
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.shapes import level
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Follower,
     LidarError,
@@ -17,9 +17,9 @@ from lidarpool import (
     SceneInstance,
     Sensor,
     Track,
+    box,
     load_sensor,
 )
-from lidarsim import box
 
 VLP16 = load_sensor("velodyne/vlp16")
 GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)

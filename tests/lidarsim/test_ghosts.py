@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 
-from lidarpool import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarsim import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import WATER_INDEX, fresnel, wet_surface_factor
 from lidarsim.scene.colors import Colors

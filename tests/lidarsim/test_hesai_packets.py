@@ -14,7 +14,7 @@ import pytest
 from tests.packet_surveys import encoded, points_of
 from tests.shapes import box, room, wall
 
-from lidarpool import (
+from lidarsim import (
     Fault,
     LidarError,
     Mounted,

@@ -9,7 +9,7 @@ import struct
 import pytest
 
 from lidarlive.devices.services import service_of
-from lidarpool import LidarError, load_sensor
+from lidarsim import LidarError, load_sensor
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
 

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import trimesh
 
+from lidarfiles import read_cloud
 from lidarfiles.clouds.format_table import point_suffixes
-from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
+from lidarreal import compare
 from lidarscenario.campaign.campaign import CampaignSpec
 from lidarscenario.points.point_scene import scene_from_points, surfel_mesh
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarscenes import load_robot
 from lidarscenes.helios import import_survey
-from lidarsim import LidarError
+from lidarsim import LidarError, load_sensor, load_trajectory
 from lidarsim.io.input_files import open_input, read_input, read_input_text
 from lidarsim.io.storage import Storage
 from lidarsim.io.yamlfile import read_yaml

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.shapes import level, wall
 
-from lidarpool import Beams, LidarError, Material, Noise, Pose, Scene, Sensor, Survey, load_sensor
+from lidarsim import Beams, LidarError, Material, Noise, Pose, Scene, Sensor, Survey, load_sensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
+from lidarreal import compare
 from lidarscenario.points.point_scene import scene_from_points
 from lidarsim import LidarError, Scene
 from lidarsim.scene.files import coordinate_systems

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tests.shapes import wall
 
-from lidarpool import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Mounted, Noise, Scene, Sensor, Survey, Track, load_sensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 

@@ -14,7 +14,7 @@ from tests.packet_surveys import encoded, payloads_to, points_of
 from tests.shapes import Cart, box, room, wall
 
 from lidarfiles.clouds.navigation_files import write_instruments
-from lidarpool import (
+from lidarsim import (
     Fault,
     Imu,
     LidarError,

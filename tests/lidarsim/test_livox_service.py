@@ -16,7 +16,7 @@ from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_sh
 from lidarlive.devices.send import Sender
 from lidarlive.devices.services import service_of
 from lidarlive.playback.transmitter import sensor_streams
-from lidarpool import LidarError, load_sensor
+from lidarsim import LidarError, load_sensor
 from lidarsim.packets.encoders import PacketSource, encoder_of
 from lidarsim.packets.service import Destination
 

@@ -11,9 +11,8 @@ from PIL import Image
 from tests.lidarsim.test_gltf import glb
 from tests.meshes import write
 
-from lidarpool import LidarError, Pose, Scanner, Scene
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim import Actor, SceneInstance, SceneMesh, Sensor
+from lidarsim import Actor, LidarError, Pose, Scanner, Scene, SceneInstance, SceneMesh, Sensor
 from lidarsim.io import allowance
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import Cutout

@@ -10,7 +10,7 @@ from tests.shapes import cast_between, level
 from tests.simulated_drives import simulated_points
 
 from lidarfiles.clouds.navigation_files import write_instruments
-from lidarpool import (
+from lidarsim import (
     Gnss,
     Imu,
     LidarError,

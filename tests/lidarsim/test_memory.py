@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.shapes import BALL_AROUND as SCENE
 from tests.shapes import SPIN_OF_128_BEAMS as MANY
 
-from lidarpool import (
+from lidarsim import (
     Beams,
     Material,
     Mounted,

@@ -8,8 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from lidarpool import LidarError
-from lidarsim import Sensor, Spin, load_sensor
+from lidarsim import LidarError, Sensor, Spin, load_sensor
 from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import read_model
 from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor

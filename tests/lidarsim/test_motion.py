@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Pose, Track
+from lidarsim import LidarError, Pose, Track
 from lidarsim.motion.rotations import check_rotations, matrices, quaternions_of, rotations_of
 from lidarsim.motion.trajectory import find_batch, presence_ns, velocities
 

@@ -9,20 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.shapes import level, made, quad
 
-from lidarpool import (
-    Job,
+from lidarpool.run.job_source import input_fingerprints
+from lidarscenario import Job
+from lidarsim import (
+    Actor,
     LidarError,
     Material,
     Mounted,
     Noise,
     Pose,
+    Returns,
     Scene,
     Survey,
     Track,
+    box,
     load_sensor,
 )
-from lidarpool.run.job_source import input_fingerprints
-from lidarsim import Actor, Returns, box
 from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweep_motion import interpolate_poses

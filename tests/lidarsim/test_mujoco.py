@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Material, Mounted, MujocoScanner, Pose, Sensor, load_sensor
+from lidarsim import LidarError, Material, Mounted, MujocoScanner, Pose, Sensor, load_sensor
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
 

@@ -12,11 +12,14 @@ from rosbags.highlevel import AnyReader
 
 from lidarfiles.clouds.navigation_files import instrument_bytes, write_instruments
 from lidarfiles.clouds.writing import ExportSpec
-from lidarpool import (
+from lidarscenario import Job
+from lidarscenario.campaign.campaign import CampaignSpec
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarsim import (
     Cloud,
     Gnss,
     Imu,
-    Job,
     LidarError,
     Mounted,
     Navigation,
@@ -27,9 +30,6 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarscenario.campaign.campaign import CampaignSpec
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
 from lidarsim.motion.navigation import gnss_fixes, imu_samples, to_geodetic
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Stations

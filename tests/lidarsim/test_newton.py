@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Material, Mounted, NewtonScanner, Noise, Pose, Sensor, load_sensor
+from lidarsim import LidarError, Material, Mounted, NewtonScanner, Noise, Pose, Sensor, load_sensor
 
 PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, CONE, HULL, SPLAT = range(1, 12)
 VISIBLE, COLLIDES, SITE = 1, 2, 8

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.shapes import block, level, wall
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Fault,
     Gnss,

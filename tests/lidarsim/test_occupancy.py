@@ -11,8 +11,18 @@ import trimesh
 from tests.lidarsim.test_scene_flow import straight
 from tests.shapes import block, level, solid
 
-from lidarpool import Material, Mounted, Pose, Scene, Sensor, Survey
-from lidarsim import Actor, LidarError, SceneMesh, box
+from lidarsim import (
+    Actor,
+    LidarError,
+    Material,
+    Mounted,
+    Pose,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    box,
+)
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.simulator.occupancy import FREE, OccupancySimulator, VoxelGrid

@@ -18,7 +18,7 @@ from tests.shapes import Cart, box, room, wall
 
 from lidarfiles.clouds.navigation_files import write_instruments
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import (
+from lidarsim import (
     Fault,
     Imu,
     LidarError,

@@ -13,7 +13,7 @@ import pytest
 from tests.plugin_files import write_distribution
 from tests.shapes import room
 
-from lidarpool import LidarError, Pose, Returns, Sensor, Survey, load_sensor
+from lidarsim import LidarError, Pose, Returns, Sensor, Survey, load_sensor
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import (
     Datagrams,

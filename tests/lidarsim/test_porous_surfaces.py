@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.shapes import CPU, beam_along_x, cast, cast_between, wall
 
-from lidarpool import LidarError, Material, Noise, Returns, Scene, Sensor, Survey
+from lidarsim import LidarError, Material, Noise, Returns, Scene, Sensor, Survey
 from lidarsim.simulator.rig import Rig
 
 RAYS = 40_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.shapes import Cart, beam_along_x, cast, cast_between, made, wall
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -22,11 +22,11 @@ from lidarpool import (
     Returns,
     Scene,
     SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
 )
-from lidarsim import SceneMesh
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.pulses.returns import SURFACE

@@ -10,7 +10,7 @@ from tests.lidarsim import reference
 from tests.lidarsim.reference import Hit
 from tests.shapes import quad
 
-from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
+from lidarsim import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.media.weather import Air, spray_clumps
 from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import LidarError, Material, Noise, load_sensor
+from lidarsim import LidarError, Material, Noise, load_sensor
 from lidarsim.schema.model_names import model_names
 from lidarsim.sensor.models import read_model
 from lidarsim.sensor.reflectivity import SCALES

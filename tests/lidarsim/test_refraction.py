@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from tests.shapes import CPU, box, cast, level, made, solid
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -22,12 +22,12 @@ from lidarpool import (
     Returns,
     Scene,
     SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
 )
-from lidarsim import SceneMesh
 from lidarsim.media.materials import extinction, fresnel
 from lidarsim.pulses.steps.cast import MAX_PASSES, MAX_REFLECTIONS
 

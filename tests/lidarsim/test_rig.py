@@ -9,8 +9,7 @@ import pytest
 from tests.shapes import Cart, cast_between, tally_of
 
 from lidarfiles.parts.parts import pack
-from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
-from lidarsim import box
+from lidarsim import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track, box
 from lidarsim.casting import static_bodies
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.points.batch_columns import columns_of

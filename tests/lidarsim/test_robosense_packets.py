@@ -14,7 +14,7 @@ import pytest
 from tests.packet_surveys import encoded, payloads_to, points_of, posts_before_walls
 from tests.shapes import room
 
-from lidarpool import Fault, LidarError, Mounted, Noise, Pose, Returns, Survey, Track, load_sensor
+from lidarsim import Fault, LidarError, Mounted, Noise, Pose, Returns, Survey, Track, load_sensor
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.shots import Shots
 from lidarsim.sensor.models import read_model

@@ -13,8 +13,7 @@ import pytest
 import lidarscenes
 import lidarsim
 import raybeam
-from lidarpool import Actor, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
-from lidarsim import Column
+from lidarsim import Actor, Column, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
 from lidarsim.scene.shapes import capsule, cylinder
 
 # Of numpy and math: their last bits depend on the processor, or on versions of C's library.

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from tests.shapes import level
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     Cloud,
@@ -34,9 +34,9 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    box,
     load_sensor,
 )
-from lidarsim import box
 from lidarsim.columns.table import OPTIONAL, SCAN
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects

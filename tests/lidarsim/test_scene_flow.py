@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from tests.shapes import block, level, made, wall
 
-from lidarpool import (
+from lidarscenes.robots.robot import Hinge, LinkPath
+from lidarsim import (
+    Actor,
     LidarError,
     Material,
     Mounted,
@@ -23,10 +25,9 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     load_sensor,
 )
-from lidarscenes.robots.robot import Hinge, LinkPath
-from lidarsim import Actor, box
 from lidarsim.columns.table import FLOW, FLOW_EGO, SCAN
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import full_poses

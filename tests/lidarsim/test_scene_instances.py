@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.shapes import tally_of
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     LidarError,
     Material,
@@ -20,9 +20,9 @@ from lidarpool import (
     SceneMesh,
     Survey,
     Track,
+    box,
     load_sensor,
 )
-from lidarsim import box
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.scene_mesh import Cutout

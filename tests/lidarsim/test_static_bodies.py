@@ -7,7 +7,7 @@ import pytest
 from tests.shapes import level
 
 from lidarfiles.parts.parts import pack
-from lidarpool import (
+from lidarsim import (
     Actor,
     Material,
     Mounted,
@@ -21,8 +21,8 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
 )
-from lidarsim import box
 from lidarsim.casting import static_bodies
 from lidarsim.casting.clipping import box_planes, clip_triangles
 from lidarsim.columns.table import OPTIONAL

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.shapes import beam_along_x, cast, wall
 
-from lidarpool import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
+from lidarsim import Fault, Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
 from lidarsim.columns.table import CAUSES
 from lidarsim.motion.navigation import DRIVEN, OUTAGE, SKEW, WALK, WHITE
 from lidarsim.numerics.random_numbers import Purpose

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import LidarError
+from lidarsim import LidarError
 from lidarsim.io import allowance
 from lidarsim.io.archives import open_archive
 from lidarsim.io.storage import Storage

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.shapes import Cart
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import (
+from lidarsim import (
     Beams,
     LidarError,
     Mounted,

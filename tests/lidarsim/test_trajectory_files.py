@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from lidarpool import LidarError, Pose, Track, load_trajectory
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError, Pose, Track, load_trajectory
 
 # Of x 0 to 10 m, z 1 m; the values of a case are those of both rows.
 HEAD = "time_s,x,y,z"

@@ -11,7 +11,7 @@ import trimesh
 from tests import shapes
 from tests.shapes import CPU, ball, box
 
-from lidarpool import (
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -20,12 +20,12 @@ from lidarpool import (
     Returns,
     Scene,
     SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
 )
-from lidarsim import SceneMesh
 from lidarsim.media.leaves import NAMES, leaf_angle_density, mean_brightness, mean_projection
 from lidarsim.pulses.steps.light_in_media import random_depths
 from lidarsim.simulator.rig import Rig

@@ -13,7 +13,7 @@ import pytest
 from tests.packet_surveys import encoded, payloads_to, points_of, posts_before_walls
 from tests.shapes import room
 
-from lidarpool import Fault, Mounted, Noise, Pose, Returns, Survey, Track, load_sensor
+from lidarsim import Fault, Mounted, Noise, Pose, Returns, Survey, Track, load_sensor
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots

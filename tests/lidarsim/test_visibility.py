@@ -10,11 +10,11 @@ import pytest
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
 from tests.shapes import CPU, ball, cast_between, level, quad, tally_of, wall
 
-from lidarpool import (
+from lidarscenario import Job
+from lidarsim import (
     Actor,
     Beams,
     Follower,
-    Job,
     LidarError,
     Material,
     Mounted,
@@ -25,12 +25,13 @@ from lidarpool import (
     Scanner,
     Scene,
     SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
     Track,
+    box,
 )
-from lidarsim import SceneMesh, box
 from lidarsim.casting import static_bodies
 from lidarsim.columns.table import CAUSES
 from lidarsim.scene.scene_mesh import Cutout

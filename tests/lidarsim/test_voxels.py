@@ -11,7 +11,10 @@ import pytest
 from tests.lidarsim.test_vegetation import ALL_ON, AT, GROUND, MANY, cast, rays
 from tests.shapes import CPU, Cart, ball, box, cast_between
 
-from lidarpool import (
+from lidarscenario.prepare import prepare
+from lidarscenario.scenario import Scenario
+from lidarscenes.writers.scene_file import write_scene
+from lidarsim import (
     Actor,
     Beams,
     LidarError,
@@ -19,14 +22,11 @@ from lidarpool import (
     Pose,
     Scene,
     SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
 )
-from lidarscenario.prepare import prepare
-from lidarscenario.scenario import Scenario
-from lidarscenes.writers.scene_file import write_scene
-from lidarsim import SceneMesh
 from lidarsim.media.leaves import mean_projection
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes

@@ -11,19 +11,19 @@ import pytest
 from tests.cloud_counting import counts_of
 from tests.shapes import beam_along_x, cast, cast_between, quad, wall
 
-from lidarpool import (
+from lidarfiles import save_cloud
+from lidarsim import (
     Beams,
     LidarError,
     Material,
     Noise,
+    Optics,
     Returns,
     Scene,
     Sensor,
     Spin,
     Survey,
-    save_cloud,
 )
-from lidarsim import Optics
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.pulses.returns import PulseReturns

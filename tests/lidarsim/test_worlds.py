@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from lidarpool import Follower, LidarError, Mounted, Pose, Scanner, Scene, Sensor, load_sensor
+from lidarsim import Follower, LidarError, Mounted, Pose, Scanner, Scene, Sensor, load_sensor
 from lidarsim.worlds.frame_tree import FrameTree
 from lidarsim.worlds.world import World, WorldFrame
 

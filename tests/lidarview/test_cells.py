@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidarpool import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box, load_sensor
+from lidarsim import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box, load_sensor
 from lidarview.cell_pictures import MAX_BYTES
 
 SCENE = Scene.from_meshes([box("<b>Floor</b>", (40, 30, 0.1)), box("Shelf & Co", (2, 1, 3))])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.shapes import block, level
 
-from lidarpool import Scene, SceneMesh, box
 from lidarscenes.procedural.plants import SPECIES, place_instances, tree
+from lidarsim import Scene, SceneMesh, box
 from lidarsim.scene.scene_mesh import Cutout, triangle_areas
 from lidarsim.scene.simplified import MIN_PART_TRIANGLES, SimplifiedScene, cut_masks
 from lidarview.render.closeup import ScenePart, floor_and_cut_heights

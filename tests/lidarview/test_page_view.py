@@ -20,7 +20,8 @@ from lidarfiles.picture_file import (
     SensorPositions,
     sensor_positions,
 )
-from lidarpool import (
+from lidarpool.pages.opened import open_views
+from lidarsim import (
     Actor,
     Cloud,
     Column,
@@ -36,7 +37,6 @@ from lidarpool import (
     Track,
     box,
 )
-from lidarpool.pages.opened import open_views
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Z

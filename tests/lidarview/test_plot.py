@@ -11,14 +11,19 @@ import click
 import numpy as np
 import pytest
 
+from lidarfiles import save_cloud
 from lidarfiles.picture_file import PICTURE_FILE, PictureContent, SensorPositions, sensor_positions
-from lidarpool import (
+from lidarpool.cli.commands import cli
+from lidarpool.report.picture_content import planning_picture
+from lidarscenario import Planning
+from lidarscenario.plan import best
+from lidarscenario.plan.trial import run_trial
+from lidarsim import (
     Actor,
     Cloud,
     Column,
     LidarError,
     Mounted,
-    Planning,
     Pose,
     Scene,
     SceneMesh,
@@ -26,12 +31,7 @@ from lidarpool import (
     Survey,
     Track,
     box,
-    save_cloud,
 )
-from lidarpool.cli.commands import cli
-from lidarpool.report.picture_content import planning_picture
-from lidarscenario.plan import best
-from lidarscenario.plan.trial import run_trial
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
 from lidarview.render.picture_page import Page

@@ -16,8 +16,8 @@ from tests.pages import unpacked
 import lidarview.render.film
 import lidarview.viewer.sharing
 from lidarfiles.picture_file import PICTURE_FILE, PictureContent, sensor_positions
-from lidarpool import Actor, LidarError, Scene, Sensor, Survey, Track, box
 from lidarpool.cli.commands import cli
+from lidarsim import Actor, LidarError, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, SCAN, TABLE
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps

@@ -21,10 +21,11 @@ from PIL import Image
 from tests.shapes import block, level, quad
 
 from lidarfiles.color_table import TURBO
-from lidarpool import Cloud, Column, LidarError, Planning, Scene, SceneMesh, box
 from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
+from lidarscenario import Planning
 from lidarscenario.plan import best, run_trial
+from lidarsim import Cloud, Column, LidarError, Scene, SceneMesh, box
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.words import shorten_name

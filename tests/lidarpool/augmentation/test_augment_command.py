@@ -9,12 +9,13 @@ import pytest
 from click.testing import CliRunner
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
-from lidarpool import LidarError, open_recording
+from lidarfiles import open_recording
 from lidarpool.cli.commands import cli
 from lidarreal.augmentation.insertions import load_insertion
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarreal.augmentation.running import Augmentation, AugmentedRecording
 from lidarreal.augmentation.sweep_tasks import PointCounts
+from lidarsim import LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.schema.vocabulary import INSERTIONS, RETURN_MODES
 from lidarsim.sensor.optics import Mode

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import Fault, Pose, Scanner, Scene, Track, load_sensor
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.insertions import load_insertion
 from lidarreal.augmentation.object_classes import find_class
+from lidarsim import Fault, Pose, Scanner, Scene, Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError

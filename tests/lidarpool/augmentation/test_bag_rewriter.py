@@ -27,9 +27,9 @@ from tests.fake_augmenters import (
 
 from lidarfiles.clouds.ros.messages import message_store
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError
 from lidarreal.augmentation.rewriting import bag_rewriter
 from lidarreal.augmentation.rewriting.opening import open_rewriter
+from lidarsim import LidarError
 from lidarsim.columns.bags import POINT_CLOUD, point_columns
 
 TOPIC = "/front/points"

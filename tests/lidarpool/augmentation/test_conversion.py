@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
+from lidarfiles import read_cloud
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError, read_cloud
 from lidarreal.augmentation.augmented_sweep import AugmentedSweep
 from lidarreal.augmentation.conversion import open_converter
 from lidarreal.augmentation.rewriting.opening import open_rewriter
+from lidarsim import LidarError
 
 
 def converter(path, spec, sensor=None):

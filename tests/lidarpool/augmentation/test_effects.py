@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lidarfiles.identity.fingerprint import fingerprint
-from lidarpool import LidarError
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.insertions import load_insertion
 from lidarscenario.scenario import Scenario
+from lidarsim import LidarError
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import Weather
 from lidarsim.pulses.steps.step import Role

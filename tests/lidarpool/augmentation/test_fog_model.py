@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import Material, Noise, Pose, Scanner, Scene, Survey, load_sensor
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects
+from lidarsim import Material, Noise, Pose, Scanner, Scene, Survey, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene_mesh import SceneMesh

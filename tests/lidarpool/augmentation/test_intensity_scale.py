@@ -15,7 +15,6 @@ from tests.street_recordings import COUNT, record, reflectances, street
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import load_sensor
 from lidarreal.augmentation.intensity_fit import (
     NearFactors,
     Quantization,
@@ -23,6 +22,7 @@ from lidarreal.augmentation.intensity_fit import (
     is_compensated,
 )
 from lidarreal.augmentation.intensity_scale import IntensityScale
+from lidarsim import load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import normal_incidence_energy

@@ -21,8 +21,8 @@ from tests.fake_augmenters import (
 
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError
 from lidarreal.augmentation.rewriting.opening import open_rewriter
+from lidarsim import LidarError
 
 P2 = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
 

@@ -21,9 +21,9 @@ from tests.fake_augmenters import (
 
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
-from lidarpool import LidarError
 from lidarreal.augmentation.rewriting.nuscenes_categories import visibility_token
 from lidarreal.augmentation.rewriting.opening import open_rewriter
+from lidarsim import LidarError
 from lidarsim.motion.rotations import matrices
 
 CLASSES = {3: "road", 7: "Car"}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import LidarError, Sensor, load_sensor
 from lidarreal.augmentation.resampling import SensorResampler
+from lidarsim import LidarError, Sensor, load_sensor
 from lidarsim.columns.sweep import Sweep
 
 # Distances of the walls, the floor and the ceiling from the sensor, which is not in the center.

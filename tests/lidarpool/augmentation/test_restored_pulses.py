@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import Noise, Scanner, Scene, Track, load_sensor
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects
 from lidarreal.augmentation.scan_pattern import ScanPattern
+from lidarsim import Noise, Scanner, Scene, Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.weather import Weather

@@ -15,12 +15,13 @@ from distributed import Client
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
 import poolpart.deploy
+from lidarfiles import open_recording
 from lidarfiles.work.work import FOLDER, Work
-from lidarpool import LidarError, box, load_sensor, open_recording
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.running import WORK_SUFFIX, Augmentation
 from lidarreal.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
 from lidarreal.augmentation.variants import CampaignVariants, Variants
+from lidarsim import LidarError, box, load_sensor
 from lidarsim.io.storage import Storage
 
 SWEEPS = 8

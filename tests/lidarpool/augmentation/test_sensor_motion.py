@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import LidarError, box
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.ground_plane import GroundPlane
 from lidarreal.augmentation.inserted_objects import InsertedObjects
 from lidarreal.augmentation.sensor_motion import SensorMotion
+from lidarsim import LidarError, box
 from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import rotations_of
 

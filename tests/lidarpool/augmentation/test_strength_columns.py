@@ -9,10 +9,10 @@ import pytest
 from tests.street_recordings import record, reflectances
 
 from lidarfiles.clouds.recording import Recording
-from lidarpool import load_sensor
 from lidarreal.augmentation.detection_threshold import detection_threshold
 from lidarreal.augmentation.intensity_scale import IntensityScale
 from lidarreal.augmentation.strength_columns import StrengthColumns
+from lidarsim import load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.reflectivity import SCALES
 

@@ -8,23 +8,12 @@ import numpy as np
 import pytest
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
+from lidarfiles import Recording, open_recording
 from lidarfiles.clouds.boxes import SweepBoxes
-from lidarpool import (
-    Actor,
-    Augment,
-    Effects,
-    Fault,
-    Insertion,
-    LidarError,
-    Recording,
-    Sweep,
-    Track,
-    augment,
-    box,
-    load_sensor,
-    open_recording,
-)
+from lidarreal import Augment, Effects, Insertion, augment
 from lidarreal.augmentation.augmenter import Augmenter
+from lidarsim import Actor, Fault, LidarError, Track, box, load_sensor
+from lidarsim.columns.sweep import Sweep
 
 RAIN = {"rain_mm_h": 50, "visibility_km": 0.2}
 COLUMNS = ("intensity", "ring")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from lidarpool import LidarError, Pose, Scene, SceneMesh, box
 from lidarscenario.mount_sections import VehicleFile
 from lidarscenario.mounting.placements import azimuths_in_view, pack_sweeps
 from lidarscenario.mounting.study import MountStudy
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import LidarError, Pose, Scene, SceneMesh, box
 
 POST = {"box": [0.2, 0.2, 0.2]}  # a body that hides almost nothing
 PLATE = {"box": [0.5, 1.2, 1.8]}

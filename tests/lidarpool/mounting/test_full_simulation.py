@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from distributed import Client
 
 import poolpart.deploy
-from lidarpool import read_cloud
+from lidarfiles import read_cloud
 from lidarpool.cli.commands import cli
 from lidarscenario.mount_sections import VehicleFile
 from lidarscenario.mounting.study import MountStudy

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from lidarpool import Pose
 from lidarscenario.mount_sections import VehicleFile
 from lidarscenario.mounting.blind_loops import BeamSegments, CellGrid, lower_to_beams
 from lidarscenario.mounting.evaluation import MountResult
@@ -21,7 +20,7 @@ from lidarscenario.mounting.ranking import (
     rank_candidates,
 )
 from lidarscenario.mounting.search import CandidateSearch
-from lidarsim import box
+from lidarsim import Pose, box
 from lidarsim.sensor import Sensor
 
 TARGETS = (Target("car", 10, 0.1, 1.0), Target("cone", 4, 0.3, 3.0), Target("bus", 5, 0.1, 2.0))

@@ -11,13 +11,13 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from lidarpool import LidarError
 from lidarpool.cli.commands import cli
 from lidarscenario.mount_sections import VehicleFile
 from lidarscenario.mounting.search import listed_candidates
 from lidarscenario.prepare import prepare
 from lidarscenario.scenario import Scenario
 from lidarscenes.procedural.road_users import ROAD_USERS
+from lidarsim import LidarError
 from lidarsim.schema.vocabulary import BODIES, TARGETS
 
 RING = {
