@@ -45,7 +45,7 @@ class Sizes:
     seconds: float = 0.7  # for one figure
     copied: int = 1 << 26  # bytes
     sweeps: int = 100_000_000  # rays of sweeps of a scanner
-    tests: tuple[str, ...] = ("tests/raybeam", "tests/lidarsim/test_device_columns.py")
+    tests: tuple[str, ...] = ("tests/raybeam", "tests/lidarfiles/test_device_columns.py")
 
 
 QUICK = Sizes(

@@ -47,7 +47,7 @@ os.environ |= {
 
 # Folders and files of tests that need no Dask: machines with a GPU often have few packages and no
 # network. Those of raybeam need NumPy alone.
-_OF_LIDARSIM = ("lidarsim", "lidarsim/test_device_columns.py", "lidarsim/test_gpu_benchmarks.py")
+_OF_LIDARSIM = ("lidarsim", "lidarfiles/test_device_columns.py", "lidarsim/test_gpu_benchmarks.py")
 _LIDARSIM_CAN_BE_TESTED = all(map(find_spec, ("pydantic", "trimesh")))
 _WITHOUT_DASK = ("raybeam", *(_OF_LIDARSIM if _LIDARSIM_CAN_BE_TESTED else ()))
 

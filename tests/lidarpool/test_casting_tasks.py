@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
-from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F401 - fixtures
-from tests.lidarsim.test_rig import TURNED, survey
+from tests.lidarfiles.test_device_columns import MADE, backend, scenes  # noqa: F401 - fixtures
+from tests.lidarfiles.test_rig import TURNED, survey
 
 from lidarfiles.parts.parts import pack
 from lidarpool.processes.shared_memory import Pickled

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from click.testing import CliRunner
-from tests.lidarpool.test_scenario import mesh_file
+from tests.lidarscenario.test_scenario import mesh_file
 
 from lidarlive.playback.sources import open_source, scenario_job
 from lidarpool.cli.commands import cli

@@ -11,7 +11,7 @@ import pye57
 import pytest
 import yaml
 from click.testing import CliRunner
-from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
+from tests.lidarpool.test_rasters import SLOPE, X0, Y0, write
 
 from lidarfiles import read_cloud
 from lidarfiles.clouds.las_header import las_system

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from tests.lidarsim.test_actor_visibility import MOUNT, SENSOR, records_of, street
-from tests.lidarsim.test_scene_flow import turning
+from tests.lidarscenes.test_actor_visibility import MOUNT, SENSOR, records_of, street
+from tests.lidarscenes.test_scene_flow import turning
 from tests.shapes import made
 
 from lidarpool import Mounted, Survey, read_cloud, simulate

@@ -12,8 +12,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
-from tests.lidarsim.test_rig import CART, SURVEYS, TURNED
-from tests.lidarsim.test_rig import COLUMNS as RIG_COLUMNS
+from tests.lidarfiles.test_rig import CART, SURVEYS, TURNED
+from tests.lidarfiles.test_rig import COLUMNS as RIG_COLUMNS
 from tests.shapes import BALL_AROUND as SPHERE
 from tests.shapes import SPIN_OF_128_BEAMS as MANY
 from tests.shapes import cast_between

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.lidarscenes.test_opendrive import (
+from tests.lidarscenario.test_opendrive import (
     document,
     lane,
     load,

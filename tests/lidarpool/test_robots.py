@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.lidarsim.test_moving import stored_positions
+from tests.lidarpool.test_moving import stored_positions
 from tests.shapes import level, made
 
 from lidarfiles.identity.fingerprint import fingerprint

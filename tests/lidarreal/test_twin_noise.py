@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_lasers
+from tests.lidarreal.test_twin_lasers import recorded_drive, room_sweep, true_lasers
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording

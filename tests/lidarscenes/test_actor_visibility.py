@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from tests.lidarsim.test_scene_flow import straight, turning
+from tests.lidarscenes.test_scene_flow import straight, turning
 from tests.shapes import block, level, wall
 
 from lidarsim import Actor, Mounted, Pose, Scene, Sensor, Survey, box, load_sensor

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarsim.test_livox_packets import header_of, plain_crc, synthetic_shots
+from tests.lidarfiles.test_livox_packets import header_of, plain_crc, synthetic_shots
 
 from lidarlive.devices.send import Sender
 from lidarlive.devices.services import service_of

@@ -162,7 +162,7 @@ def survey():
 
 
 def hashed(**environment):
-    code = "from tests.lidarsim.test_same_bits import survey; print(survey())"
+    code = "from tests.lidarscenes.test_same_bits import survey; print(survey())"
     done = subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, **environment}, capture_output=True,
         text=True, check=False, timeout=600,

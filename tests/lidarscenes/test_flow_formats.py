@@ -14,7 +14,7 @@ import pytest
 from pypcd4 import PointCloud
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from tests.lidarsim.test_scene_flow import SENSOR, cloud_of, straight, turning, vectors
+from tests.lidarscenes.test_scene_flow import SENSOR, cloud_of, straight, turning, vectors
 from tests.shapes import block
 
 from lidarfiles import read_cloud, save_cloud

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from tests.lidarsim.test_actor_visibility import MOUNT, SENSOR, street
-from tests.lidarsim.test_scene_flow import turning
+from tests.lidarscenes.test_actor_visibility import MOUNT, SENSOR, street
+from tests.lidarscenes.test_scene_flow import turning
 
 from lidarfiles import save_cloud
 from lidarfiles.clouds.boxes import Boxes, summarize_boxes

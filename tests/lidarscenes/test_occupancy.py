@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarsim.test_scene_flow import straight
+from tests.lidarscenes.test_scene_flow import straight
 from tests.shapes import block, level, solid
 
 from lidarsim import (

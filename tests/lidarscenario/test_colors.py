@@ -14,8 +14,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from tests.lidarscenario.test_masks import card
 from tests.lidarsim.test_gltf import glb
-from tests.lidarsim.test_masks import card
 from tests.meshes import write
 from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_color

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from PIL import Image
-from tests.lidarscenes.test_robots import DAE
+from tests.lidarpool.test_robots import DAE
 
 from lidarpool.cli.scenario_commands import import_
 from lidarscenario.prepare import prepare
