@@ -20,7 +20,7 @@ COPY kernels kernels
 COPY scheduler scheduler
 COPY workflows workflows
 RUN /opt/venv/bin/pip install --no-cache-dir --no-deps --no-build-isolation \
-    ./kernels ./scheduler ./workflows/lidarsim .
+    ./kernels ./scheduler ./workflows/lidarsim ./workflows/lidarfiles ./workflows .
 # Numba caches compiled kernels for the processor of the build. Other processors compile them once.
 ENV PATH=/opt/venv/bin:$PATH NUMBA_CACHE_DIR=/var/cache/lidarpool
 RUN mkdir -m 1777 /var/cache/lidarpool \

@@ -44,7 +44,7 @@ slow: dev  ## the tests that take seconds to minutes each
 	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
 
-dist: dev  ## source distributions and wheels of all four distributions, checked, in dist/
+dist: dev  ## source distributions and wheels of all six distributions, checked, in dist/
 	@.ci/dist $(BIN)/python
 
 release: dev  ## check that this commit can be released: versions, changelog, tag, placeholders, links, wheels

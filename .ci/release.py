@@ -19,7 +19,9 @@ VERSION_FILES = (
     "scheduler/poolpart/_version.py",
     "workflows/lidarsim/_version.py",
 )
-PROJECTS = ("kernels", "scheduler", "workflows/lidarsim", ".")
+PROJECTS = (
+    "kernels", "scheduler", "workflows/lidarsim", "workflows/lidarfiles", "workflows", ".",
+)  # fmt: skip
 # Values that are unknown until the project has a public repository and named maintainers.
 _PLACEHOLDER = re.compile(r"\bPLACEHOLDER_[A-Z]+\b")
 
@@ -68,8 +70,11 @@ def _versions(version: str) -> Iterator[str]:
             yield f"{name} states version {_version(name)}, not {version}"
     for folder in PROJECTS:
         name = f"{folder}/pyproject.toml".removeprefix("./")
-        for text in tomllib.loads(_read(name))["project"]["dependencies"]:
-            own = re.match(r"(raybeam|poolpart|lidarsim)\b.*==(.*)", text)
+        project = tomllib.loads(_read(name))["project"]
+        if project.get("version", version) != version:
+            yield f"{name} states version {project['version']}, not {version}"
+        for text in project["dependencies"]:
+            own = re.match(r"(raybeam|poolpart|lidarsim|lidarfiles|lidarreal)\b.*==(.*)", text)
             if own and own[2] != version:
                 yield f"{name} requires {text}, not version {version}"
     if f"\nversion: {version}\n" not in _read("CITATION.cff"):

@@ -79,7 +79,8 @@ def test_extras_are_added_in_the_checkout(monkeypatch):
     assert install_command("lidarpool[las]") == f'pip install -e ".[las]" {at}'
     assert (
         install_command("lidarpool")
-        == "pip install -e ./kernels -e ./scheduler -e ./workflows/lidarsim -e . " + at
+        == "pip install -e ./kernels -e ./scheduler -e ./workflows/lidarsim "
+        "-e ./workflows/lidarfiles -e ./workflows -e . " + at
     )
     assert install_command("torch") == "pip install torch"
     assert f"extras         installed from {CHECKOUT}" in doctor.result_lines(

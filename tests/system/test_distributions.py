@@ -46,7 +46,7 @@ class Distribution:
 DISTRIBUTIONS = {
     "lidarpool": Distribution(
         ".",
-        ("workflows/lidarscenes", "workflows/lidarview", "workflows/lidarpool"),
+        ("workflows/lidarlive", "workflows/lidarpool"),
         without=frozenset({"pytest"}),
     ),
     "raybeam": Distribution(
@@ -71,6 +71,28 @@ DISTRIBUTIONS = {
         ),
         prints="2494 3\n",
     ),
+    "lidarfiles": Distribution(
+        "workflows/lidarfiles",
+        (".",),
+        without=frozenset(
+            {"lidarpool", "lidarreal", "poolpart", "dask", "distributed", "matplotlib", "scipy"}
+            | {"open3d", "open3d-cpu", "click"}
+        ),
+        prints="3 intensity\n",
+    ),
+    "lidarreal": Distribution(
+        "workflows",
+        ("lidarscenes", "lidarview", "lidarscenario", "lidarreal"),
+        without=frozenset({"lidarpool", "poolpart", "dask", "distributed", "rich"}),
+        prints="(2296, 4) (2083, 4)\n",
+    ),
+}
+# Those that each requires of the others.
+REQUIRED = {
+    "lidarpool": {"raybeam", "poolpart", "lidarsim", "lidarfiles", "lidarreal"},
+    "lidarsim": {"raybeam"},
+    "lidarfiles": {"raybeam", "lidarsim"},
+    "lidarreal": {"raybeam", "lidarsim", "lidarfiles"},
 }
 # Files of a distribution beside its package.
 ABOUT = {"pyproject.toml", "README.md", "LICENSE"}
@@ -110,7 +132,7 @@ def test_other_distributions_are_required_at_the_same_version(name):
     required = [Requirement(text) for text in declared(name)["project"]["dependencies"]]
     others = {one.name: str(one.specifier) for one in required if one.name in DISTRIBUTIONS}
     assert set(others.values()) <= {f"=={__version__}"}
-    assert {*others} == {WHOLE: {*PARTS}, "lidarsim": {"raybeam"}}.get(name, set())
+    assert {*others} == REQUIRED.get(name, set())
 
 
 # Packages that always come with another.
@@ -128,6 +150,9 @@ OPTIONAL = {
     "betterosi": ("lidarfiles/clouds/osi.py", "lidarscenario/traffic/osi_trace.py"),
     "cuda": ("raybeam/cuda_backend.py",),
     "cupy": ("raybeam/cuda_backend.py",),
+    "dask": ("lidarfiles/work/cluster_map.py",),
+    "distributed": ("lidarfiles/work/cluster_map.py",),
+    "poolpart": ("lidarfiles/work/cluster_map.py",),
     "cyclonedds": ("lidarlive/playback/dds.py", "lidarlive/playback/serialized_topics.py"),
     "foxglove": ("lidarlive/viewers/foxglove_server.py",),
     "fsspec": ("lidarsim/io/storage.py",),
@@ -222,6 +247,34 @@ def test_imports_are_required_or_checked():
     assert {name for name, unused in places.items() if unused} == set()
 
 
+# Optional packages of no extra: users install them for other reasons, or they come with a package
+# of an extra.
+WITHOUT_EXTRA = {
+    "IPython", "cupy", "cuda", "google", "kr8s", "llvmlite", "lpips", "lz4", "mujoco", "numba",
+    "ouster", "pandas", "torch",
+}  # fmt: skip
+_PROVIDERS = {"rerun": ["rerun-sdk"]}  # of packages that tests do without
+
+
+def test_optional_imports_are_in_an_extra_of_their_distribution():
+    providers = importlib.metadata.packages_distributions()
+    missing = set()
+    for name, distribution in DISTRIBUTIONS.items():
+        extras = declared(name)["project"].get("optional-dependencies", {})
+        texts = [text for texts in extras.values() for text in texts]
+        offered = {plain(Requirement(text).name) for text in texts}
+        if "s3fs" in offered:
+            offered.add("fsspec")
+        if "poolpart" in offered:
+            offered |= {"dask", "distributed"}
+        for imported, prefixes in OPTIONAL.items():
+            own = [one for one in prefixes if one.partition("/")[0] in distribution.imports]
+            names = {plain(one) for one in providers.get(imported, _PROVIDERS.get(imported, ()))}
+            if own and imported not in WITHOUT_EXTRA and not names & (offered | {"raybeam"}):
+                missing |= {f"{name}: {imported}"}
+    assert missing == set()
+
+
 def required_imports(name: str, providers: Mapping[str, list[str]]) -> set[str]:
     """Import names of the packages that a distribution requires, without extras."""
     required = {Requirement(text).name for text in declared(name)["project"]["dependencies"]}
@@ -276,7 +329,7 @@ def test_they_hold_the_files_that_git_has_and_no_others(built, name):
         text=True,
         check=True,
     ).stdout.split()
-    if name == "lidarsim":  # whose package is the folder of the distribution
+    if DISTRIBUTIONS[name].packages == (".",):  # the package is the folder of the distribution
         tracked = [file for file in tracked if file not in ABOUT]
     assert len(tracked) > 20
     stem = f"{name}-{__version__}"

@@ -151,13 +151,40 @@ class Rings:
         ambiguous, because the median elevation of a ring depends on the surfaces that it hits. It
         can change by more than the angle between neighboring rings.
         """
-        from scipy.optimize import linear_sum_assignment
-
         rows = np.full(len(medians), -1)
         runs = np.flatnonzero(is_ring)
-        chosen, assigned = linear_sum_assignment(np.abs(medians[runs, None] - self.elevation_rad))
+        chosen, assigned = assign_nearest(medians[runs], self.elevation_rad)
         rows[runs[chosen]] = assigned
         return rows
+
+
+def assign_nearest(values: Floats, targets: Floats) -> tuple[Ints, Ints]:
+    """Pair values with targets so that the sum of the absolute differences is as small as possible.
+
+    Each value and each target is in one pair at most, and the pairs keep the order of the numbers,
+    which no other pairs can improve. `values` has shape (n,), and `targets` has shape (m,). The
+    results are the indices of the values and of their targets, each with shape (min(n, m),).
+    """
+    if len(values) > len(targets):
+        chosen, assigned = assign_nearest(targets, values)
+        return assigned, chosen
+    order, target_order = np.argsort(values, kind="stable"), np.argsort(targets, kind="stable")
+    cost = np.abs(values[order, None] - targets[target_order])
+    # sums[j]: the smallest sum of the pairs of the values so far with some of the first j targets.
+    sums = np.zeros(len(targets) + 1)
+    is_paired = np.empty(cost.shape, bool)  # value i with target j, rather than with an earlier one
+    for row, costs in enumerate(cost):
+        paired = sums[:-1] + costs
+        paired[:row] = np.inf  # the values before take as many targets
+        best = np.minimum.accumulate(paired)
+        sums = np.concatenate([[np.inf], best])
+        is_paired[row] = paired < sums[:-1]
+    pairs = np.empty(len(values), np.int64)
+    last = len(targets)
+    for row in range(len(values) - 1, -1, -1):
+        last = int(np.flatnonzero(is_paired[row, :last])[-1])
+        pairs[row] = last
+    return order, target_order[pairs]
 
 
 def elevations(points: Floats) -> Floats:

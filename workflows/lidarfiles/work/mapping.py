@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
+from lidarsim.environment.extras import require_package
 from lidarsim.io.allowance import memory
 
 from ..processes.processors import processor_count
@@ -51,6 +52,7 @@ def parallel_map(
         memory.
     """
     if client is not None:
+        require_package("poolpart", "cluster", "Work on a cluster")
         from .cluster_map import cluster_map  # imports Dask
 
         with cluster_map(client) as run:

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
 from ..errors import LidarError, message_of, prefix_errors, unreadable_message
 
 CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
-_PARTS = ("./kernels", "./scheduler", "./workflows/lidarsim", ".")  # distributions of a checkout
+# Distributions of a checkout in the order of their requirements, and their folders.
+_FOLDERS = {
+    "raybeam": "./kernels",
+    "poolpart": "./scheduler",
+    "lidarsim": "./workflows/lidarsim",
+    "lidarfiles": "./workflows/lidarfiles",
+    "lidarreal": "./workflows",
+    "lidarpool": ".",
+}
 
 
 def install_command(*requirements: str) -> str:
     """Return the command that installs requirements, such as ``lidarpool[las]``.
 
     Since lidarpool is not available from a package index, its extras are installed from a checkout.
+    Where lidarpool itself is not installed, the command names the installed distribution that has
+    the extra.
     """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
@@ -23,13 +34,24 @@ def install_command(*requirements: str) -> str:
     for name in requirements:
         # The installation is editable so that changes to the checkout take effect.
         if name == "lidarpool":
-            words += [word for part in _PARTS for word in ("-e", part)]
+            words += [word for part in _FOLDERS.values() for word in ("-e", part)]
         elif name.startswith("lidarpool["):
-            words += ["-e", f".{name.removeprefix('lidarpool')}"]
+            words += ["-e", f"{_installed_folder()}{name.removeprefix('lidarpool')}"]
         else:
             words.append(name)
     command = install_command(*words)
     return command if words == [*requirements] else f"{command} in {CHECKOUT}"
+
+
+def _installed_folder() -> str:
+    """Return the folder of the highest distribution that is installed."""
+    for name in ("lidarpool", "lidarreal", "lidarfiles", "lidarsim"):
+        try:
+            version(name)
+        except PackageNotFoundError:
+            continue
+        return _FOLDERS[name]
+    return _FOLDERS["lidarpool"]  # not installed: the checkout is on the path
 
 
 def require_package(package: str, extra: str, purpose: str) -> None:
