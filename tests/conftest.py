@@ -45,20 +45,27 @@ os.environ |= {
     "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
 }
 
-# Folders and files of tests that need no Dask: machines with a GPU often have few packages and no
-# network. Those of raybeam need NumPy alone.
-_OF_LIDARSIM = ("lidarsim", "lidarfiles/test_device_columns.py", "lidarsim/test_gpu_benchmarks.py")
-_LIDARSIM_CAN_BE_TESTED = all(map(find_spec, ("pydantic", "trimesh")))
-_WITHOUT_DASK = ("raybeam", *(_OF_LIDARSIM if _LIDARSIM_CAN_BE_TESTED else ()))
+# Packages that the tests in a folder need, if not Dask: machines with a GPU often have few packages
+# and no network, and each distribution is tested with its own requirements only.
+_RECORDED = ("matplotlib", "open3d", "scipy", "trimesh")
+_NEEDED = {
+    "raybeam": ("numpy",),
+    "lidarsim": ("pydantic", "trimesh"),
+    "lidarfiles": ("cloudpickle", "fsspec", "trimesh"),
+    "lidarscenes": _RECORDED,
+    "lidarview": _RECORDED,
+    "lidarscenario": _RECORDED,
+    "lidarreal": _RECORDED,
+}
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out tests that need Dask where it is not installed."""
-    if find_spec("distributed") is not None:
+    """Leave out tests of packages whose requirements are not installed."""
+    parts = collection_path.relative_to(Path(__file__).parent).parts
+    if not parts:
         return None
-    place = collection_path.relative_to(Path(__file__).parent).as_posix()
-    left_in = place in (".", *_WITHOUT_DASK) or place.startswith("raybeam/")
-    return None if left_in else True
+    needed = _NEEDED.get(parts[0], ("distributed",))
+    return None if all(map(find_spec, needed)) else True
 
 
 # Dask's own clusters look this long after each death whether the worker is there, and give it up

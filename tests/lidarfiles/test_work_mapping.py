@@ -211,37 +211,3 @@ def test_processes_end_with_the_process_that_has_started_them(tmp_path):
     process.communicate()
     gone, alive = psutil.wait_procs(started, timeout=10)
     assert len(gone) == 2 and not alive
-
-
-def test_a_map_on_this_machine_imports_no_dask():
-    code = "import lidarfiles.work.process_pool, sys; print('dask' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
-
-
-@pytest.mark.extended(every=6)
-@pytest.mark.parametrize(
-    "module",
-    [
-        "augmentation.running",
-        "reconstruction.building",
-        "comparing.fit.fitting",
-        "comparing.surveys.comparing_surveys",
-        "comparing.two_clouds",
-        "occupancy.writing",
-        "mounting.study_files",
-        "cli.mount_command",
-        "recordings.opening",
-        "scenario.scenario",
-        "playback.player",
-        "following.node",
-        "serving.service",
-    ],
-)
-def test_what_needs_no_cluster_imports_neither_dask_nor_what_draws(module):
-    code = (
-        f"import sys, lidarpool.{module}; "
-        "print(*{'dask', 'distributed', 'tornado', 'matplotlib', 'jinja2'} & {*sys.modules})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []

@@ -269,7 +269,9 @@ def test_optional_imports_are_in_an_extra_of_their_distribution():
             offered |= {"dask", "distributed"}
         for imported, prefixes in OPTIONAL.items():
             own = [one for one in prefixes if one.partition("/")[0] in distribution.imports]
-            names = {plain(one) for one in providers.get(imported, _PROVIDERS.get(imported, ()))}
+            names = {
+                plain(one) for one in providers.get(imported, _PROVIDERS.get(imported, [imported]))
+            }
             if own and imported not in WITHOUT_EXTRA and not names & (offered | {"raybeam"}):
                 missing |= {f"{name}: {imported}"}
     assert missing == set()

@@ -7,9 +7,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import trimesh
-from trimesh.exchange.obj import export_obj
-from trimesh.exchange.ply import export_ply
 
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.storage import replace_file
@@ -71,6 +68,10 @@ def check_target(path: Path) -> None:
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Return a scene as the content of a file with the given extension in `SUFFIXES`."""
+    import trimesh
+    from trimesh.exchange.obj import export_obj
+    from trimesh.exchange.ply import export_ply
+
     if scene.has_voxels.any():
         name = scene.object_names[scene.has_voxels.argmax()]
         raise LidarError(
