@@ -81,7 +81,7 @@ lint: dev docs  ## format check, lint, types, spelling, names, layers, documenta
 	$(BIN)/lint-imports
 	$(BIN)/python .ci/names.py
 	$(BIN)/python .ci/stubs.py --check
-	$(BIN)/python .ci/lines.py
+	$(BIN)/python .ci/lines.py --check
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
