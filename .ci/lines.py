@@ -2,8 +2,8 @@
 
 Usage: python .ci/lines.py [--write|--check]
 
-``--write`` writes the numbers of the packages to ARCHITECTURE.md, in thousands. ``--check`` fails if
-a number there is wrong by more than two thousand lines.
+``--write`` writes the numbers of the packages to ARCHITECTURE.md, in thousands. ``--check`` fails
+if a number there is wrong by more than two thousand lines.
 """
 
 import re
@@ -19,7 +19,7 @@ TOLERANCE = 2  # thousand lines
 
 
 def main() -> None:
-    """Print a row for each package and each folder in it, the tests, benchmarks and documentation."""
+    """Print a row for each package, each folder in it, and each folder of other code."""
     packages = [path for root in ("kernels", "scheduler") for path in (ROOT / root).iterdir()]
     packages += (ROOT / "workflows").iterdir()
     folders = [*packages, *(ROOT / "workflows").glob("*/*")]
