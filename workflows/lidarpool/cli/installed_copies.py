@@ -41,7 +41,8 @@ def find_second_copy() -> str:
 
 
 _REMEDY = (
-    f"Uninstall lidarpool, lidarsim, poolpart and raybeam, then run {install_command('lidarpool')}"
+    f"Uninstall lidarpool, lidarreal, lidarfiles, lidarsim, poolpart and raybeam, then "
+    f"run {install_command('lidarpool')}"
 )
 
 
