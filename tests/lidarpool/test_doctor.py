@@ -135,8 +135,8 @@ def test_a_copy_that_hides_an_editable_installation_is_reported(install):
     checkout, site = install(in_site=PACKAGES, editable=True)
     assert installed_copies.find_second_copy() == (
         f"There are two copies of lidarpool: it is imported from {site}, so changes in "
-        f"{checkout} have no effect. Uninstall lidarpool, lidarreal, lidarfiles, lidarsim, poolpart and raybeam, then run "
-        + install_command("lidarpool")
+        f"{checkout} have no effect. Uninstall lidarpool, lidarreal, lidarfiles, lidarsim, "
+        "poolpart and raybeam, then run " + install_command("lidarpool")
     )
 
 

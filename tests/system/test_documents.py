@@ -508,7 +508,7 @@ def test_the_readme_has_the_commands_of_a_bare_machine_in_their_order():
     places = [
         text.index(command)
         for command in (
-            "\napt-get update\n", "\napt-get install ", "\ngit clone ", "\nmake demo ",
+            "\napt-get update\n", "\napt-get install ", "\nmake demo ",
             "\nmake test ", "\nlidarpool scene ",
         )
     ]  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
 from ..errors import LidarError, message_of, prefix_errors, unreadable_message
@@ -45,6 +44,8 @@ def install_command(*requirements: str) -> str:
 
 def _installed_folder() -> str:
     """Return the folder of the highest distribution that is installed."""
+    from importlib.metadata import PackageNotFoundError, version  # for errors only: it takes long
+
     for name in ("lidarpool", "lidarreal", "lidarfiles", "lidarsim"):
         try:
             version(name)
