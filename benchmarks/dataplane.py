@@ -38,7 +38,7 @@ from lidarpool.run.cluster.cluster import local_client
 from lidarpool.run.cluster.requirements import slots_needed
 from lidarpool.run.job_source import SingleJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.pipeline import rigs
+from lidarpool.run.pipeline import stage2_intersect as stage
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.pipeline.stage_names import GPU, INTERSECT, LIDAR
 from lidarpool.run.pipeline.task_records import Recorder
@@ -104,10 +104,10 @@ def replay_casting(dask_worker: Any) -> None:
     batches are views of these.
     """
     dask_worker.transfer_outgoing_log = deque()  # of all transfers, not only of the last
-    cast_batch = rigs.cast_batch
+    cast_batch = stage.cast_batch
     prepared: dict[str, list[PartColumns]] = {}  # {handle of a rig: one scan, and more scans}
 
-    def replay(rig: Rig, work: rigs.CastWork, first: int, stop: int) -> rigs.CastBatch:
+    def replay(rig: Rig, work: stage.CastWork, first: int, stop: int) -> stage.CastBatch:
         recorder = Recorder(INTERSECT, GPU)
         scans = stop - first
         if work.handle not in prepared:
@@ -117,9 +117,9 @@ def replay_casting(dask_worker: Any) -> None:
         if len(parts[-1].counts) < scans:
             parts[1:] = [repeated(parts[0], scans)]
         part = first_scans(parts[-1], first, scans)
-        return rigs.CastBatch(work.job, part, recorder.finish(scans))
+        return stage.CastBatch(work.job, part, recorder.finish(scans))
 
-    rigs.cast_batch = replay
+    stage.cast_batch = replay
 
 
 def repeated(part: PartColumns, scans: int) -> PartColumns:

@@ -37,7 +37,7 @@ from typing import Any
 import psutil
 from distributed import Client, get_worker
 
-import lidarpool.run.pipeline.rigs
+import lidarpool.run.pipeline.stage2_intersect
 from lidarpool import Campaign, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
 from lidarsim.scene.actors import box
@@ -60,13 +60,13 @@ async def _workers(
     first: int = 0,
 ) -> None:
     """Run workers like `run_workers`, with batches that take `seconds` to cast."""
-    columns_of = lidarpool.run.pipeline.rigs.columns_of
+    columns_of = lidarpool.run.pipeline.stage2_intersect.columns_of
 
     def slowly(points: Any) -> Any:
         time.sleep(seconds)
         return columns_of(points)
 
-    lidarpool.run.pipeline.rigs.columns_of = slowly
+    lidarpool.run.pipeline.stage2_intersect.columns_of = slowly
     await run_workers(connection, address, count, slots, first)
 
 

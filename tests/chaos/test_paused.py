@@ -49,7 +49,7 @@ def lonely(arena):
             assert time.monotonic() < deadline, f"{name} did not join"
             time.sleep(0.05)
         arena.client.run(
-            lambda: bool(import_module("lidarpool.run.pipeline.long_stage_tasks")), workers=found
+            lambda: bool(import_module("lidarpool.run.pipeline.long_stages")), workers=found
         )
         arena.withdraw(partition)
         return name

@@ -13,6 +13,7 @@ from tests.lidarfiles.test_rig import TURNED, survey
 from lidarfiles.parts.parts import pack
 from lidarpool.processes.shared_memory import Pickled
 from lidarpool.run.pipeline import rigs
+from lidarpool.run.pipeline import stage2_intersect as stage
 from lidarpool.run.pipeline.failures import naming_scans
 from lidarsim import Scene, box
 from lidarsim.simulator.rig import Rig
@@ -50,12 +51,12 @@ def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):  # noqa: F811
     driven = MADE["on the move"]
     spans = [(0, 9), (9, 28)]
-    monkeypatch.setattr(rigs, "Recorder", lambda *_: SimpleNamespace(finish=lambda scans: None))
+    monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(finish=lambda scans: None))
     tasks = []
     for name in (backend, "numpy"):
         rig = Rig(scenes["both"], driven, name)
-        monkeypatch.setattr(rigs, "rig_of", lambda *_, rig=rig: rig)
-        done = rigs.intersect([rigs.CastWork(0, "a run", spans)], (), None, None)
+        monkeypatch.setattr(stage, "rig_of", lambda *_, rig=rig: rig)
+        done = stage.intersect([stage.CastWork(0, "a run", spans)], (), None, None)
         tasks.append(pickle.loads(pickle.dumps(done, protocol=5)))
     for mine, other in zip(*tasks, strict=True):
         samples = mine.part.samples

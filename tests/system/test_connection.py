@@ -35,9 +35,9 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
         (server,) = set(client.run(os.getppid).values())
         assert psutil.Process(server).ppid() == os.getpid()
         modules = client.run(
-            lambda: {"lidarpool.run.pipeline.long_stage_tasks", "open3d"} & sys.modules.keys()
+            lambda: {"lidarpool.run.pipeline.stage4_collect", "open3d"} & sys.modules.keys()
         )
-        assert list(modules.values()) == [{"lidarpool.run.pipeline.long_stage_tasks"}] * 2
+        assert list(modules.values()) == [{"lidarpool.run.pipeline.stage4_collect"}] * 2
     assert set(psutil.Process(server).children()) <= others
     # Those of the user's own processes.
     assert forkserver._forkserver._preload_modules == preload

@@ -255,7 +255,7 @@ def raise_at(scan: int | str | None, scan_of=None):
             "Preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
         (
-            "lidarpool.run.pipeline.long_stage_tasks.pack",
+            "lidarpool.run.pipeline.stage4_collect.pack",
             raise_at(None),
             r"Stage collect failed: scan \d+: FloatingPointError",
         ),

@@ -30,7 +30,8 @@ from ...identity.software import describe_difference, software_query
 from ...processes.shared_memory import Pickled, SharedHandle, SharedValue
 from .batches import Outcome
 from .failures import DeviceLost, JobError, error_of, memory_clause, raise_if_failed, was_killed
-from .rigs import CastWork, MemoryUnseen, RigFailed, RigMissing, drop_all, intersect
+from .rigs import MemoryUnseen, RigFailed, RigMissing, drop_all
+from .stage2_intersect import CastWork, intersect
 from .stage_messages import BatchRange
 from .stage_names import INTERSECT
 

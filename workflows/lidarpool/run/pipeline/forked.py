@@ -22,7 +22,7 @@ from lidarfiles.identity import versions
 from lidarfiles.processes.freed_memory import keep_freed_memory
 from lidarscenario.plan import trial  # noqa: F401
 
-from . import casting_workers, long_stage_tasks  # noqa: F401
+from . import casting_workers, stage1_generate, stage3_sort, stage4_collect  # noqa: F401
 
 keep_freed_memory()
 # Workers that are starting and nannies remove the folders of stopped workers at the same time. The

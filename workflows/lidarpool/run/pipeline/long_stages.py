@@ -1,8 +1,13 @@
 """Long-running stages 1, 3 and 4, and the pipes between them and the driver.
 
-The functions that run on workers are in `long_stage_tasks.py`. A pipe consists of a Dask Queue and
-a Dask Variable, which other clients can access by name. In the following names, RUN is the ID of
-the run, and N increases each time a stage is started.
+The functions that run on workers are in `stage1_generate.py`, `stage3_sort.py` and
+`stage4_collect.py`. Each of them processes messages from the driver until a pipe is closed. A
+failed pipe also ends a stage silently, because the driver knows the reason. Each stage secedes from
+the thread pool of its worker but keeps its slot, so that a worker with one thread and four LIDAR
+slots can run four of them.
+
+A pipe consists of a Dask Queue and a Dask Variable, which other clients can access by name. In the
+following names, RUN is the ID of the run, and N increases each time a stage is started.
 
 ===============================  ============================================
 lidarpool-RUN-scans              ranges of scans and errors, from stage 1 to the driver
@@ -36,7 +41,9 @@ from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...identity.software import call_with_same_sources
 from .failures import convert_storage_errors, memory_clause, raise_if_failed, was_killed
-from .long_stage_tasks import collect, generate, sort_frames
+from .stage1_generate import generate
+from .stage3_sort import sort_frames
+from .stage4_collect import collect
 from .stage_messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .stage_names import COLLECT, GENERATE, SORT
 from .task_records import TaskRecord
