@@ -289,6 +289,24 @@ def test_a_task_that_was_moved_counts_for_its_new_worker(start, wait_until):
     assert all(client.gather(futures))
 
 
+def wait_elsewhere(part, ready, gate):
+    wait_for(ready)
+    return part.submit(wait_for, gate).result()
+
+
+def test_a_slot_is_used_as_soon_as_a_task_lends_it(start, monkeypatch):
+    monkeypatch.setattr("poolpart.shares.CHECK_EVERY_S", 3600.0)
+    client = start({name: {"resources": {name: 1}} for name in "PQ"})
+    p, q = (Partition(name, client) for name in "PQ")
+    parent = p.submit(wait_elsewhere, q, "ready", "gate")
+    other = p.submit(abs, -1)
+    await_queued(p, 1)
+    Event("ready", client).set()
+    assert other.result(LONG_S) == 1
+    Event("gate", client).set()
+    assert parent.result(LONG_S)
+
+
 @pytest.fixture
 def many(start, monkeypatch):
     """Partition of more workers than are compared for a task. Waiting tasks are not moved."""

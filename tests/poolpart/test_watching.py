@@ -68,24 +68,21 @@ def test_a_task_stays_on_its_worker_while_another_slot_is_free(
     scheduler = client.cluster.scheduler
     client.sync(scheduler.extensions["stealing"].stop)
     part = Partition("A", client)
-    release, gate = event(client), event(client)
-    release.set()  # so that tasks are expected to be short, and are assigned in advance
-    client.gather([part.submit(wait_for, release.name) for _ in range(20)])
-    release.clear()
-    x, y = (scheduler.workers[client.cluster.workers[name].address] for name in "xy")
-    running = part.submit(wait_for, gate.name, workers="x")
-    other = part.submit(wait_for, release.name, workers="y")
-    wait_until(lambda: x.processing and y.processing)
+    gates = {name: event(client) for name in "xy"}
+    running = [part.submit(wait_for, gate.name, workers=name) for name, gate in gates.items()]
+    names = {client.cluster.workers[name].address: name for name in "xy"}
+    wait_until(lambda: all(scheduler.workers[address].executing for address in names))
+    # A worker with a bound task has room for another task.
     options = {"workers": "x"} if why == "bound" else {}
-    waiting = [part.submit(wait_for, gate.name, **options) for _ in range(4)]
-    wait_until(lambda: len(x.processing) >= 2)
-    on_x = {task.key for task in x.processing}
-    release.set()
-    wait_until(lambda: other.key not in {task.key for task in y.processing})
+    waiting = part.submit(worker_name, key="waiting", **options)
+    wait_until(lambda: "waiting" in scheduler.tasks and scheduler.tasks["waiting"].processing_on)
+    home = names[scheduler.tasks["waiting"].processing_on.address]
+    gates["y" if home == "x" else "x"].set()
     time.sleep(0.3)  # several checks
-    assert on_x <= {task.key for task in x.processing}
-    gate.set()
-    assert all(client.gather([running, other, *waiting]))
+    assert not waiting.done()
+    gates[home].set()
+    assert waiting.result(LONG_S) == home
+    assert all(client.gather(running))
 
 
 def until_cancelled(name):
