@@ -1,6 +1,7 @@
 """The death of a worker is blamed on the tasks that it was running."""
 
 import os
+import time
 
 import pytest
 from distributed import Event, KilledWorker, wait
@@ -34,10 +35,16 @@ def test_only_running_tasks_are_blamed(own_nannies, part, wait_until):
     assert (stats.done, stats.failed) == (39, 1)
 
 
+def kill_soon():
+    """Kill the worker after it has reported the tasks that ended before this one."""
+    time.sleep(0.2)
+    os._exit(1)
+
+
 def test_before_the_first_heartbeat_the_next_task_in_line_is_blamed(own_nannies, part):
-    """The task with the higher priority runs first, and kills each of its workers at once."""
+    """The task with the higher priority runs first, and kills each of its workers."""
     own_nannies.cluster.scheduler.allowed_failures = 1
     futures = [part.submit(abs, -number) for number in range(10)]
-    killer = part.submit(os._exit, 1, priority=1)
+    killer = part.submit(kill_soon, priority=1)
     assert own_nannies.gather(futures) == [*range(10)]
     assert isinstance(killer.exception(LONG_S), KilledWorker)
