@@ -12,6 +12,7 @@ from lidarpool.cli.commands import cli
 from lidarscenario.occupancy.class_names import occ3d_class
 from lidarscenario.occupancy.writing import OccupancySettings, write_occupancy
 from lidarsim import LidarError
+from lidarsim.simulator.occupancy import VoxelGrid
 
 SCENARIO = """
 scene:
@@ -178,6 +179,35 @@ def test_existing_grids_are_kept_unless_they_are_to_be_overwritten(scenario, kit
     assert "describes another grid. Use another folder" in str(outcome.exception)
     assert not (out / "gts").exists()
     assert {path.name: path.read_bytes() for path in kitti.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("layout", "folder", "others"),
+    [
+        ("semantickitti", "sequences/00/voxels", ["000007.txt", "../../01/voxels/000007.bin"]),
+        ("occ3d", "gts/scene-0001", ["notes/labels.npz", "../other/labels.npz"]),
+    ],
+)
+def test_files_of_a_longer_earlier_run_are_removed(tmp_path, layout, folder, others):
+    path, out = tmp_path / "street.yaml", tmp_path / "out"
+    settings = OccupancySettings(layout, VoxelGrid((-2, -2, -2), (2, 2, 2), 1), backend="numpy")
+
+    def write(duration, target, **options):
+        path.write_text(SCENARIO.replace("time_s: 0.3", f"time_s: {duration}"))
+        write_occupancy(path, target, settings, workers=1, **options)
+        return {file.relative_to(target).as_posix() for file in target.rglob("*") if file.is_file()}
+
+    longer = write(0.6, out)
+    kept = [out / folder / name for name in others]
+    for file in kept:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("of the user")
+    shorter = write(0.3, tmp_path / "shorter")
+    assert len(shorter) < len(longer)
+    names = {file.resolve().relative_to(out.resolve()).as_posix() for file in kept}
+    assert write(0.3, out, overwrite=True) == shorter | names
+    assert {file.read_text() for file in kept} == {"of the user"}
+    assert not [left for left in out.rglob("*") if left.is_dir() and not any(left.iterdir())]
 
 
 def test_class_names_of_other_data_sets():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -22,6 +23,10 @@ from lidarsim.words import list_names
 from .class_names import OCC3D_CLASSES, occ3d_class
 
 FREE_OCC3D = 17
+_ENDINGS = ("bin", "label", "occluded", "invalid", "instance")
+# Patterns of the names of files and folders.
+_SWEEP = "[0-9]" * 6
+_TOKEN = "[0-9a-f]" * 32
 OTHER_OBJECT = 99  # SemanticKITTI class that evaluations ignore
 
 
@@ -71,6 +76,13 @@ class GridLayout(ABC):
         """Return the paths of the files of a sweep of the sensor."""
 
     @abstractmethod
+    def existing_paths(self, folder: Path) -> Iterator[str]:
+        """Yield the paths of the files in a folder that belong to the job and sensor.
+
+        They may belong to more sweeps than the job has.
+        """
+
+    @abstractmethod
     def contents(self, occupancy: Occupancy) -> tuple[bytes, ...]:
         """Return the contents of the files of a sweep, in the order of `paths`."""
 
@@ -108,6 +120,11 @@ class Occ3d(GridLayout):
     def paths(self, number: int) -> tuple[str, ...]:
         """Return the path of `labels.npz`."""
         return (f"gts/{self._scene}/{self._tokens[number]}/labels.npz",)
+
+    def existing_paths(self, folder: Path) -> Iterator[str]:
+        """Yield the paths of `labels.npz` for all frame tokens of the scene."""
+        for path in folder.glob(f"gts/{self._scene}/{_TOKEN}/labels.npz"):
+            yield path.relative_to(folder).as_posix()
 
     def contents(self, occupancy: Occupancy) -> tuple[bytes, ...]:
         """Return the content of `labels.npz`."""
@@ -165,6 +182,12 @@ class SemanticKitti(GridLayout):
         """Return the paths of the five files of a sweep."""
         return _voxel_files(self._sequence, number)
 
+    def existing_paths(self, folder: Path) -> Iterator[str]:
+        """Yield the paths of the files of all sweeps in the sequence."""
+        for ending in _ENDINGS:
+            for path in folder.glob(f"sequences/{self._sequence}/voxels/{_SWEEP}.{ending}"):
+                yield path.relative_to(folder).as_posix()
+
     def contents(self, occupancy: Occupancy) -> tuple[bytes, ...]:
         """Return the contents of the five files of a sweep."""
         classes = occupancy.classes
@@ -180,8 +203,7 @@ class SemanticKitti(GridLayout):
 
 def _voxel_files(sequence: str, number: int) -> tuple[str, ...]:
     """Return the paths of the files of a sweep in the layout of SemanticKITTI."""
-    endings = ("bin", "label", "occluded", "invalid", "instance")
-    return tuple(f"sequences/{sequence}/voxels/{number:06}.{ending}" for ending in endings)
+    return tuple(f"sequences/{sequence}/voxels/{number:06}.{ending}" for ending in _ENDINGS)
 
 
 def _packed(voxels: Bools) -> bytes:

@@ -7,8 +7,8 @@ the sweeps. No point cloud is required, and the files do not depend on the numbe
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,7 +17,7 @@ from lidarfiles.clouds.cloud_format import Entry
 from lidarfiles.clouds.folder import check_new_result, check_not_existing, result_folder
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.work.mapping import describe_sweeps, parallel_map
-from lidarfiles.work.work import FileStep, Inputs, Work, link_files
+from lidarfiles.work.work import FileStep, Inputs, Work, fingerprint_files, link_files
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.simulator.occupancy import GridFrame, OccupancySimulator, VoxelGrid
 from lidarsim.words import join_names
@@ -94,6 +94,7 @@ class _Task(NamedTuple):
     path: Path
     number: int | None  # job of a campaign, or None for a scenario
     settings: OccupancySettings
+    state: str  # fingerprint of the scenario files, which may change between two calls
     sweeps: range
 
     @property
@@ -109,6 +110,7 @@ class _OpenJob:
     path: Path
     number: int | None
     settings: OccupancySettings
+    state: str
 
     @cached_property
     def job(self) -> Job:
@@ -153,6 +155,18 @@ class _OpenJob:
         entry = (job.number, job.name, job.split, dict(job.values))
         return fingerprint(job.scene), fingerprint(job.survey), entry, self.backend
 
+    def paths(self) -> Iterator[str]:
+        """Yield the paths of all files, relative to the output folder."""
+        for sweep in range(self.layout.count):
+            yield from self.layout.paths(sweep)
+
+    def tasks(self) -> Iterator[_Task]:
+        """Yield the tasks that compute the files."""
+        sweeps = range(self.layout.count)
+        for first in range(0, len(sweeps), _TASK_SWEEPS):
+            stop = first + _TASK_SWEEPS
+            yield _Task(self.path, self.number, self.settings, self.state, sweeps[first:stop])
+
     @cached_property
     def simulator(self) -> OccupancySimulator:
         """Simulator of the grids."""
@@ -168,14 +182,43 @@ class _OpenJob:
         )
 
 
+@dataclass
+class _Jobs:
+    """Jobs whose grids are written.
+
+    Attributes
+    ----------
+    tasks
+        Tasks that compute the files.
+    identities
+        What the files depend on, for each job.
+    existing
+        Paths of files of the jobs in the output folder.
+    notes
+        Notes for the user, without duplicates.
+    """
+
+    tasks: list[_Task] = field(default_factory=list)
+    identities: list[Any] = field(default_factory=list)
+    existing: set[str] = field(default_factory=set)
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def add(self, opened: _OpenJob, out: Path) -> None:
+        """Add a job. `out` is the output folder."""
+        self.tasks += opened.tasks()
+        self.identities.append(opened.identity)
+        self.existing.update(opened.layout.existing_paths(out))
+        self.notes |= dict.fromkeys(opened.layout.notes())
+
+
 @lru_cache(maxsize=1)
-def _open_job(path: Path, number: int | None, settings: OccupancySettings) -> _OpenJob:
-    return _OpenJob(path, number, settings)
+def _open_job(path: Path, number: int | None, settings: OccupancySettings, state: str) -> _OpenJob:
+    return _OpenJob(path, number, settings, state)
 
 
 def _compute_files(task: _Task) -> dict[str, bytes]:
     """Return the files of the sweeps of a task."""
-    opened = _open_job(task.path, task.number, task.settings)
+    opened = _open_job(task.path, task.number, task.settings, task.state)
     files: dict[str, bytes] = {}
     for sweep in task.sweeps:
         occupancy = opened.simulator.sweep(sweep, task.settings.following)
@@ -228,7 +271,8 @@ def write_occupancy(
     restart
         Whether to remove an unfinished computation in the folder.
     overwrite
-        Whether to replace existing files.
+        Whether to replace existing files. Files of the same jobs and sensor are removed if they
+        belong to an earlier result with more sweeps.
     progress
         Function that is called with the number of finished sweeps and the number of all sweeps.
 
@@ -246,21 +290,15 @@ def write_occupancy(
     if not replaces:
         _check_same_grid(out / INFO_FILE, info)
         _check_first_files(out, settings, numbers)
-    notes: dict[str, None] = {}
-    tasks: list[_Task] = []
-    jobs: list[Any] = []
+    sources = _source_files(path)
+    state = fingerprint({name: fingerprint_files(file) for name, file in sources.items()})
+    jobs = _Jobs()
     for number in numbers:
-        opened = _open_job(path, number, settings)
-        layout = opened.layout
-        notes |= dict.fromkeys(layout.notes())
-        names = (name for sample in range(layout.count) for name in layout.paths(sample))
-        check_not_existing((out / name for name in names), overwrite=replaces)
-        jobs.append(opened.identity)
-        tasks += [
-            _Task(path, number, settings, range(layout.count)[first : first + _TASK_SWEEPS])
-            for first in range(0, layout.count, _TASK_SWEEPS)
-        ]
-    inputs = _inputs(path, settings, jobs)
+        opened = _open_job(path, number, settings, state)
+        check_not_existing((out / name for name in opened.paths()), overwrite=replaces)
+        jobs.add(opened, out)
+    inputs = Inputs(sources, {"jobs": jobs.identities, "options": settings})
+    tasks = jobs.tasks
     total = sum(len(task.sweeps) for task in tasks)
     done = 0
     files: dict[str, Path] = {}
@@ -274,17 +312,18 @@ def write_occupancy(
                 files |= found
                 done += len(task.sweeps)
                 progress(done, total)
-        with work.publishing(INFO_FILE, merge=True) as staged:
+        longer = sorted(jobs.existing - {*files}) if replaces else []
+        with work.publishing(INFO_FILE, longer, merge=True) as staged:
             link_files(files, staged)
             (staged / INFO_FILE).write_bytes(info)
-    return WrittenOccupancy(len(numbers), total, len(files), tuple(notes))
+    return WrittenOccupancy(len(numbers), total, len(files), tuple(jobs.notes))
 
 
-def _inputs(path: Path, settings: OccupancySettings, jobs: Sequence[Any]) -> Inputs:
-    """Return what the files depend on. Workers read the files of the scenario again."""
+def _source_files(path: Path) -> dict[str, Path]:
+    """Return the files of the scenario, which workers read again."""
     source = CampaignSpec if is_campaign(path) else Scenario
     files = {str(file): file for file in sorted(source.load(path).files)}
-    return Inputs({"scenario": path, **files}, {"jobs": jobs, "options": settings})
+    return {"scenario": path, **files}
 
 
 def _job_numbers(path: Path, job: int | None) -> Sequence[int | None]:
