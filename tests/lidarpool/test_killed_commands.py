@@ -23,7 +23,8 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 from lidarfiles import save_cloud
 from lidarfiles.work import publishing, work
 from lidarfiles.work.work import FOLDER, Step
-from lidarpool.report import result_pictures
+from lidarpool.cli import flight_command, stations_command
+from lidarpool.report import flight_map, result_pictures
 from lidarpool.report.result_pictures import publish_pictures
 from lidarreal import twin
 from lidarreal.augmentation.effects import Effects
@@ -38,6 +39,7 @@ from lidarscenario.mounting import pictures
 from lidarscenario.mounting.evaluation import MountEvaluator, MountResult
 from lidarscenario.mounting.study_files import rank_mounts
 from lidarscenario.occupancy import writing
+from lidarscenario.plan import flight, flight_density, stations
 from lidarsim import Cloud
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, WRITING, replace_file
@@ -279,6 +281,78 @@ class OccupancyUser(User):
         )
 
 
+HALL = """
+scene:
+  copies: [{{name: Wall, box: [0.2, 4, 2], at: [[{version}, 0, 0]]}}]
+  ground: {{margin_m: 8}}
+sensor: velodyne/vlp16
+"""
+
+
+@dataclass(frozen=True)
+class FakePicture:
+    plan: object
+    density: object = None
+
+    def save(self, path):
+        shown = getattr(self.plan, "stations", None)
+        path.write_text(f"{self.plan.length_m if shown is None else shown}")
+
+
+def run_command(command, *arguments):
+    """Run a command without the messages that the program prints for errors."""
+    with command.make_context(command.name, [*arguments]) as context:
+        command.invoke(context)
+
+
+class StationsUser(User):
+    last = "out/stations.yaml"
+    resumes = True
+    source = "2.yaml"
+    noun = "scene"
+
+    def prepare(self, folder, patches):
+        for version in (1, 2):
+            (folder / f"{version}.yaml").write_text(HALL.format(version=version))
+        places = np.mgrid[-6:6:2, -6:6:2, 2:3].reshape(3, -1).T.astype(np.float64)
+        patches.setattr(stations, "candidates", lambda *arguments: places)
+        patches.setattr(stations, "sensor_elevations", lambda sensor: (-0.5, 0.5))
+        patches.setattr(stations, "_POINTS", 100)
+        patches.setattr(result_pictures, "draw_stations", FakePicture)
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        options = ("--out", str(outputs / "out"), "--spacing", "2", "--workers", "1")
+        start = ("--resume",) if resume else ()
+        run_command(
+            stations_command.stations, f"{inputs}/{version}.yaml", *options, *start, "--overwrite"
+        )
+
+
+class FlightUser(User):
+    """Plan of which the second version has no coordinate system, and therefore fewer files."""
+
+    last = "out/flight.yaml"
+
+    def prepare(self, folder, patches):
+        plans = {}
+        compute = flight.plan_flight
+
+        def plan_flight(shape, *arguments, **settings):
+            if shape.wkt not in plans:
+                plans[shape.wkt] = compute(shape, *arguments, **settings)
+            return plans[shape.wkt]
+
+        patches.setattr(flight, "plan_flight", plan_flight)
+        patches.setattr(flight_density, "SAMPLED_RAYS", 1000)
+        patches.setattr(flight_map, "draw_flight", FakePicture)
+
+    def run(self, inputs, outputs, version, *, resume=False):
+        options = ("--sensor", "riegl-vq780i", "--agl", "700", "--out", str(outputs / "out"))
+        system = ("--epsg", "25832") if version == 1 else ()
+        area = f"0,0,{version}00,200"
+        run_command(flight_command.flight, area, *options, *system, "--overwrite")
+
+
 class CompareUser(User):
     last = "out/compare.json"
 
@@ -358,6 +432,8 @@ USERS: dict[str, Callable[[], User]] = {
     "augment, campaign": AugmentCampaignUser,
     "mount": MountUser,
     "occupancy": OccupancyUser,
+    "stations": StationsUser,
+    "flight": FlightUser,
     "compare": CompareUser,
     "fit": FitUser,
     "plot": PlotUser,

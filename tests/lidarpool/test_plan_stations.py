@@ -1,7 +1,9 @@
 """Stations for terrestrial scans: areas that are known by hand, and where nobody can stand."""
 
 import json
+import pickle
 import re
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from click.testing import CliRunner
 from tests.shapes import block, level, quad, wall
 
 from lidarpool.cli.commands import cli
+from lidarscenario.plan import stations
 from lidarscenario.plan.stations import (
     StationVisibility,
     candidates,
@@ -407,6 +410,10 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
             "`--count` cannot be used with `--cloud`",
         ),
         (
+            ["hall.glb", "--cloud", "scan.npy", "--resume", "--workers", "2"],
+            "`--resume` and `--workers` cannot be used with `--cloud`",
+        ),
+        (
             ["hall.glb", "--cloud", "scan.npy", "--within", "0"],
             "`--within` must be greater than 0, but is 0",
         ),
@@ -436,6 +443,54 @@ def test_options_are_checked_before_the_scene_is_read(tmp_path, options, says):
     outcome = CliRunner().invoke(cli, ["stations", str(tmp_path / "damaged.obj"), *options])
     assert outcome.exit_code != 0
     assert says in outcome.output + str(outcome.exception)
+
+
+@pytest.mark.parametrize(
+    "options", [["--resume", "--restart"], ["--workers", "2", "--scheduler", "tcp://h:1"]]
+)
+def test_options_that_contradict_each_other(tmp_path, options):
+    outcome = CliRunner().invoke(cli, ["stations", str(tmp_path / "hall.glb"), *options])
+    assert outcome.exit_code != 0 and "cannot be combined" in outcome.output
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_visibility_is_computed_by_processes_in_chunks(monkeypatch):
+    """Without processes, a scene with few candidates does not need to wait for them to start."""
+    scene = Scene.from_meshes(rooms((0, -3, 2)))
+    monkeypatch.setattr(stations, "_POINTS", 500)
+    counts = []
+
+    @contextmanager
+    def parallel_map(client, count, worker_bytes, workers):
+        counts.append(count)
+        # As in processes, which receive pickled functions and items.
+        yield lambda function, items: [
+            pickle.loads(pickle.dumps(function))(pickle.loads(pickle.dumps(item))) for item in items
+        ]
+
+    plans = [plan_stations(scene, EVERYWHERE, spacing_m=1.0, slant_deg=90)]
+    monkeypatch.setattr(stations, "parallel_map", parallel_map)
+    plans += [
+        plan_stations(scene, EVERYWHERE, spacing_m=1.0, slant_deg=90, workers=workers)
+        for workers in (None, 2)
+    ]
+    chunks = -(-len(plans[0].candidates) // 32)
+    assert chunks > 1 and counts == [0, chunks]
+    for name in ("stations", "coverage", "reachable_m2", "covered_m2"):
+        first, *others = (getattr(plan, name).tobytes() for plan in plans)
+        assert others == [first, first]
+
+
+@pytest.mark.extended
+def test_a_plan_does_not_depend_on_the_number_of_processes():
+    scene = Scene.from_meshes(rooms((0, -3, 2)))
+    first, *others = (
+        plan_stations(scene, EVERYWHERE, spacing_m=0.7, workers=workers) for workers in (1, 2, 3)
+    )
+    assert len(first.candidates) > 96
+    for plan in others:
+        np.testing.assert_array_equal(plan.stations, first.stations)
+        assert plan.covered_m2.tobytes() == first.covered_m2.tobytes()
 
 
 def test_the_table_has_the_names_that_targets_match(tmp_path):

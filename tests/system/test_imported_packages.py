@@ -44,7 +44,10 @@ def imported(statement: str) -> set[str]:
         pytest.param(
             "import lidarscenario.mounting.study_files", _LARGE - {"numba", "scipy"}, id="ranking"
         ),
-        pytest.param("import lidarpool.cli.mount_command", _LARGE, id="mount command"),
+        *(
+            pytest.param(f"import lidarpool.cli.{name}_command", _LARGE, id=f"{name} command")
+            for name in ("flight", "mount", "occupancy", "stations")
+        ),
         pytest.param("import lidarscenario.plan.stations", _LARGE, id="stations"),
         pytest.param("import lidarlive.following.node", _LARGE, id="follow"),
         pytest.param("import lidarlive.serving.service", _LARGE - {"numba", "scipy"}, id="serve"),

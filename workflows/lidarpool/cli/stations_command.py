@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.errors import LidarError
 from lidarsim.words import join_names, plural, printable
 
 from . import completion
@@ -36,9 +37,13 @@ if TYPE_CHECKING:
     from lidarsim.numerics.arrays import Floats
     from lidarsim.sensor import Sensor
 
+    from ..connection.tls_files import TlsFiles
+
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
 _FORMATS = ("laz", "e57")  # formats to which the results of plans are exported
+# Options for the computation of a plan in several processes, which can be resumed.
+_MAP_OPTIONS = ("resume", "restart", "workers", "scheduler")
 _SHOWN_OBJECTS = 12  # maximum number of objects listed individually
 _DOMINANT_SHARE = 0.75  # an object with a larger share of the reachable area causes a note
 _MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a note
@@ -134,6 +139,9 @@ def _parse_percentage(text: str) -> float:
     help="Output folder for stations.yaml and stations.png (default: named after the scene).",
 )
 @options.mesh_reading
+@options.scheduler
+@options.workers
+@options.unfinished("plan")
 @overwrite
 @options.as_json
 def stations(
@@ -162,12 +170,15 @@ def stations(
       lidarpool stations site.glb --sensor riegl-vz400 --coverage 95% --target "Wall*" --target Roof
       lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
+      lidarpool stations site.glb --sensor riegl-vz400 --spacing 0.5 --workers 8 --resume
       lidarpool stations hall-stations/stations.yaml --cloud hall-scan
     """  # noqa: D301 - Click requires the character \b
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
+    options.check_workers(settings["workers"], settings["scheduler"])
+    options.check_unfinished(resume=settings["resume"], restart=settings["restart"])
     print_first_step("reading the scene", quiet=settings["as_json"])
-    from lidarfiles.clouds.folder import check_not_existing, result_folder
+    from lidarfiles.clouds.folder import check_new_result, result_folder
     from lidarscenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
@@ -180,63 +191,98 @@ def stations(
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
     else:
         out = settings.pop("out")
-        overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
+        start = {name: settings.pop(name) for name in ("resume", "restart")}
         with result_folder(folder):
-            files = (folder / name for name in (PLAN_FILE, PICTURE_FILE))
-            check_not_existing(files, overwrite=overwrites)
+            files = (PLAN_FILE, PICTURE_FILE)
+            check_new_result(folder, files, **start, overwrite=settings.pop("overwrite"))
             scenario = Scenario.load(scene, of_mesh)
             own = scenario.sensor
             if model is None and own.model is None and own.calibration is None:
                 raise click.UsageError(
                     f"`--sensor` is required, because {scene} does not specify a sensor model."
                 )
-            _plan(scenario, model, folder, **settings)
+            _plan(scene, scenario, model, folder, start, **settings)
 
 
 def _plan(
-    scenario: Scenario, model: str | None, folder: Path, as_json: bool, **settings: Any
+    path: Path,
+    scenario: Scenario,
+    model: str | None,
+    folder: Path,
+    start: dict[str, bool],
+    *,
+    scheduler: str | None,
+    files: TlsFiles,
+    workers: int | None,
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Choose stations, write them to a scenario and a plot, and print a summary."""
-    from lidarfiles.work.publishing import publishing
+    from lidarfiles.work.work import Inputs, Work
     from lidarscenario.plan.stations import plan_stations, sensor_elevations
 
     from ..report.result_pictures import draw_stations
+    from ..run.cluster.connection import connect_client
     from .terminal import Terminal
 
     sensor, entry = _planned_sensor(scenario, model, folder)
     sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
     prepared, notes = prepared_with_notes(scenario, terminal)
-    with terminal.status("computing the visibility from all candidate positions"):
-        plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
     columns = planned_columns(_FORMATS, prepared.survey.materials)
     sections, omissions = carried_sections(scenario, folder, columns)
     if sections.pop("navigation", None):
         omissions.append("`navigation` is omitted, because the stations are separate poses")
     remarks = [f"Warning: {warning}" for warning in terminal.warnings]
     remarks += [f"Note: {note}." for note in omissions]
-    text = _stations_scenario(sections | {"sensor": entry}, plan, settings["targets"], remarks)
-    with (
-        explain_os_errors(f"The stations cannot be written to {folder}", "free some disk space"),
-        publishing(folder / PLAN_FILE) as staged,
-    ):
-        (staged / PLAN_FILE).write_text(text, "utf-8", newline="\n")
-        with terminal.status("drawing the picture"):
-            draw_stations(plan).save(staged / PICTURE_FILE)
-    shortfalls = [*omissions, *_shortfalls(plan, settings["count"], settings["coverage"])]
-    if settings["targets"]:
-        shortfalls += _unreachable_notes(prepared.scene.names, plan, "candidate positions")
-    else:
-        shortfalls += _target_notes(plan, prepared)
-    figures = _plan_figures(plan, prepared, sensor.model, [*notes, *shortfalls])
-    note_lines = map("note: {}".format, shortfalls)
-    options.print_results(
-        figures, chain(_plan_lines(plan, prepared, settings["targets"]), note_lines), as_json
+    scene = prepared.scene.with_world_origin((0, 0, 0))
+    others = {str(file): file for file in sorted(scenario.files) if file != path}
+    inputs = Inputs(
+        {"scene": path, **others},
+        {
+            "objects and sections": (scene, sections, remarks),
+            "sensor": (sensor, entry),
+            "options": settings,
+        },
     )
+    with Work.open(folder, inputs, noun="plan", **start) as work:
+        with (
+            nullcontext() if scheduler is None else connect_client(scheduler, files) as client,
+            terminal.status("computing the visibility from all candidate positions"),
+        ):
+            plan = plan_stations(
+                scene, sensor, client=client, workers=workers, work=work, **settings
+            )
+        text = _stations_scenario(sections | {"sensor": entry}, plan, settings["targets"], remarks)
+        with work.publishing(PLAN_FILE) as staged:
+            (staged / PLAN_FILE).write_text(text, "utf-8", newline="\n")
+            with terminal.status("drawing the picture"):
+                draw_stations(plan).save(staged / PICTURE_FILE)
+    omissions += _shortfalls(plan, settings["count"], settings["coverage"])
+    _print_plan(plan, prepared, settings["targets"], notes, omissions, as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
         click.echo(f"next: lidarpool check {shlex.quote(str(folder / PLAN_FILE))}")
+
+
+def _print_plan(
+    plan: StationPlan,
+    prepared: PreparedScenario,
+    targets: Sequence[str],
+    notes: list[str],
+    shortfalls: list[str],
+    as_json: bool,
+) -> None:
+    """Print the stations and the covered areas. `notes` have already been printed."""
+    if targets:
+        more = _unreachable_notes(prepared.scene.names, plan, "candidate positions")
+    else:
+        more = _target_notes(plan, prepared)
+    shortfalls = [*shortfalls, *more]
+    figures = _plan_figures(plan, prepared, [*notes, *shortfalls])
+    note_lines = map("note: {}".format, shortfalls)
+    options.print_results(figures, chain(_plan_lines(plan, prepared, targets), note_lines), as_json)
 
 
 def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
@@ -252,6 +298,12 @@ def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
         raise click.UsageError(
             f"{join_names(unused)} cannot be used with `--cloud`, because the stations and the "
             f"sensor are those in {scene}."
+        )
+    map_options = {f"--{name}": settings[name] for name in _MAP_OPTIONS}
+    if unused := [f"`{name}`" for name, value in map_options.items() if value]:
+        raise click.UsageError(
+            f"{join_names(unused)} cannot be used with `--cloud`, which reads the points in this "
+            "process and writes no files."
         )
 
 
@@ -456,12 +508,12 @@ def _stations_scenario(
 
 
 def _plan_figures(
-    plan: StationPlan, prepared: PreparedScenario, sensor: str, notes: list[str]
+    plan: StationPlan, prepared: PreparedScenario, notes: list[str]
 ) -> dict[str, Any]:
     """Return a station plan as a dictionary for JSON."""
     names = prepared.scene.names
     return {
-        "sensor": sensor,
+        "sensor": plan.sight.sensor.model,
         "places": len(plan.candidates),
         "spacing_m": plan.spacing_m,
         "stations": [

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lidarfiles.open3d_access.neighbors import nearest_neighbors
+from lidarfiles.work.mapping import MapFunction, parallel_map
+from lidarfiles.work.work import Step, Work
 from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import match_names
@@ -22,6 +24,9 @@ from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sensor import Sensor, Spin
 from lidarsim.words import name_hint
 from raybeam import RayCaster
+
+if TYPE_CHECKING:
+    from lidarfiles.work.mapping import Client
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # minimum fraction of the reachable area per station by default
@@ -35,6 +40,9 @@ _CLEARANCE_M = 0.3  # minimum distance of the instrument from any surface
 _STEP_M = 0.2  # maximum height of surfaces that an operator can step on
 _FOOT_M = 0.01  # a ray that starts at this height above the floor does not hit the floor
 _SPHERE_RAYS = 128  # number of rays in all directions from each candidate
+_CHUNK = 32  # number of candidates that a process receives together
+_PROCESS_CHUNKS = 32  # starting a process takes as long as this number of chunks
+_WORKER_BYTES = 1 << 30
 _SECTORS = 36  # azimuth sectors, all of which contain rays if the sensor scans the full circle
 
 
@@ -43,19 +51,27 @@ class StationVisibility:
 
     A surface is visible if it is within the sensor's range and field of view, and not occluded. The
     field of view extends from the lowest to the highest ray of the sensor. `slant_deg` is the
-    maximum angle of incidence, measured from the surface normal. Actors are ignored. Raises
-    LidarError if the sensor does not scan the full circle.
+    maximum angle of incidence, measured from the surface normal. Actors are ignored. Rays are cast
+    by `threads` threads, or one for each core. Raises LidarError if the sensor does not scan the
+    full circle.
     """
 
-    def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
+    def __init__(
+        self, scene: Scene, sensor: Sensor, slant_deg: float, threads: int | None = None
+    ) -> None:
+        self.scene = scene
         self.sensor = sensor
         self.slant_deg = slant_deg
-        self.caster = RayCaster(scene.vertices, scene.faces)
+        self.caster = RayCaster(scene.vertices, scene.faces, threads=threads)
         # Tolerance for the single precision of the ray caster and of points in pictures.
         self._slack = max(2e-3, 2e-5 * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))))
         lowest, highest = sensor_elevations(sensor)
         self._lowest = lowest - 1e-9
         self._highest = highest + 1e-9
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Processes share the cores.
+        return StationVisibility, (self.scene, self.sensor, self.slant_deg, 1)
 
     def visible_sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
         """Determine which side of the surface at each point is visible from a station.
@@ -149,6 +165,9 @@ def plan_stations(
     height_m: float = 1.7,
     spacing_m: float | None = None,
     slant_deg: float = 80.0,
+    client: Client | None = None,
+    workers: int | None = None,
+    work: Work | None = None,
 ) -> StationPlan:
     """Choose stations for a terrestrial scan.
 
@@ -177,12 +196,21 @@ def plan_stations(
         Spacing of the candidates in meters. By default, there are about 600 candidates.
     slant_deg
         Maximum angle of incidence, in degrees from the surface normal, in (0, 90].
+    client
+        Client of a cluster whose OTHER workers compute the visibility from the candidates. By
+        default, it is computed on this machine.
+    workers
+        Number of processes on this machine. The plan does not depend on it. By default, processes
+        are only started for a large number of candidates.
+    work
+        Unfinished work that keeps the visibility from the candidates, and provides that of an
+        earlier run.
 
     Raises
     ------
     LidarError
         If a value is out of range, if a target matches no object, if the sensor does not scan the
-        full circle, or if no candidate position exists or sees a target.
+        full circle, if no candidate position exists or sees a target, or if the cluster is lost.
 
     Examples
     --------
@@ -209,7 +237,11 @@ def plan_stations(
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
     positions = candidates(scene, sight.caster, height_m, spacing_m)
-    visibility = _visibility(_sample_surfaces(scene, is_target), sight, positions)
+    chunks = -(-len(positions) // _CHUNK)
+    processes = chunks if workers is not None else chunks // _PROCESS_CHUNKS
+    with parallel_map(client, processes, _WORKER_BYTES, workers) as run:
+        samples = _sample_surfaces(scene, is_target)
+        visibility = _visibility(samples, sight, positions, run, work)
     if not len(visibility.area_m2):
         raise LidarError(
             f"{'No target' if targets else 'Nothing'} is reachable from the {len(positions):,} "
@@ -330,16 +362,66 @@ class _Visibility(NamedTuple):
     area_m2: Floats  # (n,), area that a side represents
 
 
+class _Chunk(NamedTuple):
+    """Consecutive candidates."""
+
+    first: int
+    positions: Floats  # (c, 3), local meters
+
+    @property
+    def label(self) -> str:
+        """Candidates of the chunk, for messages."""
+        return f"candidates {self.first + 1:,} to {self.first + len(self.positions):,}"
+
+
+class _VisibleSides(NamedTuple):
+    """Sides of surface samples that are visible from each candidate of a chunk.
+
+    Each side of a surface counts separately, because a thin wall has a side in each room.
+    """
+
+    bits: NDArray[np.uint8]  # (c, ceil(2n / 8)): the side of each normal, then the opposite sides
+
+
+_VISIBILITY = Step("visibility", (_VisibleSides,))
+
+
+@dataclass(frozen=True)
+class _FindVisibleSides:
+    """Function that determines which sides of surface samples are visible from candidates."""
+
+    sight: StationVisibility
+    samples: _SurfaceSamples
+
+    def __call__(self, chunk: _Chunk) -> tuple[_VisibleSides]:
+        points, normals = self.samples.points, self.samples.normals
+        sides = np.stack([self.sight.visible_sides(p, points, normals) for p in chunk.positions])
+        visible = np.concatenate([sides > 0, sides < 0], axis=1)
+        return (_VisibleSides(np.packbits(visible, axis=1)),)
+
+
 def _visibility(
-    samples: _SurfaceSamples, sight: StationVisibility, positions: Floats
+    samples: _SurfaceSamples,
+    sight: StationVisibility,
+    positions: Floats,
+    run: MapFunction,
+    work: Work | None,
 ) -> _Visibility:
     """Return the sides of surface samples that are visible from local `positions`."""
-    sides = np.stack([sight.visible_sides(p, samples.points, samples.normals) for p in positions])
-    # Each side of a surface counts separately, because a thin wall has a side in each room.
-    visible = np.concatenate([sides > 0, sides < 0], axis=1)
-    columns = np.flatnonzero(visible.any(axis=0))
+    function = _FindVisibleSides(sight, samples)
+    chunks = [
+        _Chunk(first, positions[first : first + _CHUNK])
+        for first in range(0, len(positions), _CHUNK)
+    ]
+    results = (
+        run(function, chunks) if work is None else work.each(_VISIBILITY, run, function, chunks)
+    )
+    bits = np.concatenate([found.bits for (found,) in results])
+    count = 2 * len(samples.points)
+    columns = np.flatnonzero(np.unpackbits(np.bitwise_or.reduce(bits), count=count))
+    visible = np.unpackbits(bits, axis=1, count=count)[:, columns].view(np.bool_)
     owner = np.tile(samples.owner, 2)[columns]
-    return _Visibility(visible[:, columns], owner, np.tile(samples.area_m2, 2)[columns])
+    return _Visibility(visible, owner, np.tile(samples.area_m2, 2)[columns])
 
 
 class _Choice(NamedTuple):
