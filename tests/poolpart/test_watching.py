@@ -173,8 +173,9 @@ def test_a_task_that_blocks_its_worker_fails_as_well(nannies, monkeypatch, tmp_p
     both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
     with pytest.raises(TaskTimeoutError):
         both.submit(stop_worker, tmp_path / "stopped", timeout_s=0.5).result(LONG_S)
-    # It runs again if no heartbeat has reported it, and then it is known to be the cause.
-    assert len((tmp_path / "stopped").read_text().split()) <= 2
+    # It runs again if no heartbeat has reported it, and then it is known to be the cause. A busy
+    # machine may need one more attempt.
+    assert len((tmp_path / "stopped").read_text().split()) <= watching.MOST_BLOCKED
     assert nannies.gather([both.submit(abs, -number) for number in range(9)]) == [*range(9)]
 
 
