@@ -24,6 +24,9 @@ enough of its memory limit. If the task whose turn it is needs more memory than 
 with the most free memory is reserved: other tasks that hold memory are not assigned to it until
 the first one is. The memory of a task that has lent its slots can only be used by nested tasks. All
 of this is part of the scheduler's `valid_workers`, so that it also applies to tasks that are moved.
+
+A task that may have blocked its worker is assigned to a worker without other tasks (`isolate`). If
+there is none, one worker gets no further tasks until its tasks have ended.
 """
 
 from __future__ import annotations
@@ -76,6 +79,7 @@ class _Bounds(NamedTuple):
     """What restricts the workers of a task, apart from its partition."""
 
     is_tied: bool = False  # whether the task is nested or bound to workers
+    is_isolated: bool = False  # whether the task requires a worker without other tasks
     workers: frozenset[str] | None = None
     hosts: frozenset[str] | None = None
     memory: int = 0  # memory that it holds, in bytes
@@ -84,6 +88,11 @@ class _Bounds(NamedTuple):
     def is_restricted(self) -> bool:
         """Whether some workers of the partition may not be valid."""
         return bool(self.workers or self.hosts or self.memory)
+
+    @property
+    def needs_no_room(self) -> bool:
+        """Whether the task may be assigned to a worker that has no room for others."""
+        return self.is_tied or self.is_isolated
 
 
 _ANY_WORKER = _Bounds()
@@ -139,7 +148,9 @@ class PartitionQueue:
     with_room: dict[Any, None] = field(default_factory=dict)
     # Worker whose memory is reserved for a held task, and the key of the task.
     reserved: tuple[Any, Any] | None = None
-    tied_held: int = 0  # number of tied tasks among `held`
+    # Worker that gets no further tasks until a held task has it for itself, and the task's key.
+    cleared: tuple[Any, Any] | None = None
+    held_without_room: int = 0  # number of tasks among `held` that need no room
     free_slots: float = 0.0  # number of slots without a task
     _idle_s: float = 0.0  # time until the last change for which slots had no task, times slots
     _changed_at: float = field(default_factory=time.monotonic)  # last change of `free_slots`
@@ -159,7 +170,9 @@ class PartitionQueue:
         # the worker.
         used = load.used - min(load.tied, 1) if load.tied else load.used
         had_room = worker in self.with_room
-        if (slots and has_room(slots, used, load.seconds, had_room)) != had_room:
+        is_cleared = self.cleared is not None and self.cleared[0] is worker
+        room = slots and not is_cleared and has_room(slots, used, load.seconds, had_room)
+        if bool(room) != had_room:
             if had_room:
                 del self.with_room[worker]
             else:
@@ -172,6 +185,20 @@ class PartitionQueue:
         if load := self.loads.pop(worker, None):
             self._set_free(load, 0.0)
         self.with_room.pop(worker, None)
+        if self.cleared is not None and self.cleared[0] is worker:
+            self.cleared = None
+
+    def clear_worker(self, worker: Any, key: Any) -> None:
+        """Keep further tasks off a worker until a held task has it for itself."""
+        self._end_clearing()
+        self.cleared = worker, key
+        self.update_worker(worker)
+
+    def _end_clearing(self) -> None:
+        if self.cleared is not None:
+            worker, _ = self.cleared
+            self.cleared = None
+            self.update_worker(worker)
 
     def _set_free(self, load: _Load, slots: float) -> None:
         if slots != load.free:
@@ -227,7 +254,7 @@ class PartitionQueue:
     def hold(self, task: Any, held: _HeldTask) -> None:
         """Add a task that waits for a slot."""
         self.held[task.key] = held
-        self.tied_held += held.bounds.is_tied
+        self.held_without_room += held.bounds.needs_no_room
         heap = self.heaps.setdefault(held.client, {}).setdefault(held.bounds, [])
         self.pushed += 1
         heapq.heappush(heap, (task.priority, self.pushed, task.key))
@@ -237,9 +264,11 @@ class PartitionQueue:
         """Remove a task that no longer waits, and return its entry, if any."""
         held = self.held.pop(key, None)
         if held is not None:
-            self.tied_held -= held.bounds.is_tied
+            self.held_without_room -= held.bounds.needs_no_room
             if self.reserved is not None and self.reserved[1] == key:
                 self.reserved = None
+            if self.cleared is not None and self.cleared[1] == key:
+                self._end_clearing()
             if not self.held:
                 self.heaps.clear()  # entries of canceled tasks would remain
         return held
@@ -275,7 +304,7 @@ class Shares(SchedulerPlugin):
         self.weights: dict[str, float] = {}
         self._clients: dict[Any, str] = {}  # {task key: name of its client}
         self._assigned_in: dict[Any, PartitionQueue] = {}  # {task key: queue of its partition}
-        self._isolated: set[Any] = set()  # keys of tasks that use all slots of their workers
+        self._isolated: set[Any] = set()  # keys of tasks that must not share a worker
         self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
         # {task with memory: worker to which it may be moved}
         self._moves: dict[Any, Any] = {}
@@ -306,7 +335,7 @@ class Shares(SchedulerPlugin):
             for task in worker.processing:
                 if name in (task.resource_restrictions or ()):
                     now = time.monotonic()
-                    held = _HeldTask(self._client_of(task), _bounds_of(task), now, task)
+                    held = _HeldTask(self._client_of(task), self._bounds_of(task), now, task)
                     queue.policy.add_waiting(held.client, now)
                     self._start(queue, held, worker, now)
             queue.update_worker(worker)
@@ -354,8 +383,21 @@ class Shares(SchedulerPlugin):
                 )
 
     def isolate(self, key: Any) -> None:
-        """Let a task use all slots of its worker from the next time on that it is assigned."""
+        """Assign a task to a worker of its own from the next time on.
+
+        Nested and bound tasks may have to wait on the same worker as others. They only use all of
+        its slots.
+        """
         self._isolated.add(key)
+
+    def keeps_free(self, worker: Any) -> bool:
+        """Return whether other tasks are kept off a worker because of an isolated task."""
+        if not self._isolated:
+            return False
+        cleared = (queue.cleared for queue in self.queues.values())
+        return any(entry is not None and entry[0] is worker for entry in cleared) or any(
+            task.key in self._isolated for task in worker.processing
+        )
 
     def client_of_key(self, key: Any) -> str | None:
         """Return the client for which a task counts, or None if the task is unknown."""
@@ -413,7 +455,7 @@ class Shares(SchedulerPlugin):
             computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
             seconds = sum(computing) if computing else None
         queue.policy.finish(key, time.monotonic(), seconds)
-        if queue.held and queue.with_room:
+        if queue.held and (queue.with_room or queue.cleared is not None):
             self._dispatch_soon()
 
     def log_event(self, topic: str, msg: Any) -> None:
@@ -477,7 +519,7 @@ class Shares(SchedulerPlugin):
             return None
         task.priority = priority_of_waiting(task)
         now = time.monotonic()
-        held = _HeldTask(self._client_of(task), _bounds_of(task), now, task)
+        held = _HeldTask(self._client_of(task), self._bounds_of(task), now, task)
         if not queue.held and (worker := self._worker_for(queue, held)) is not None:
             queue.policy.add_waiting(held.client, now)
             self._start(queue, held, worker, now)
@@ -485,9 +527,24 @@ class Shares(SchedulerPlugin):
         queue.hold(task, held)
         if task.state == "waiting":
             hold_task(self.scheduler, task, now)
-        if queue.with_room or held.bounds.is_tied:
+        if queue.with_room or held.bounds.needs_no_room:
             self._dispatch_soon()
         return None
+
+    def _bounds_of(self, task: Any) -> _Bounds:
+        workers, hosts = task.worker_restrictions, task.host_restrictions
+        is_tied = bool(workers) or submitter_of(task) is not None
+        is_isolated = not is_tied and task.key in self._isolated
+        memory = memory_of(task)
+        if not (is_tied or is_isolated or hosts or memory):
+            return _ANY_WORKER
+        return _Bounds(
+            is_tied,
+            is_isolated,
+            frozenset(workers) if workers else None,
+            frozenset(hosts) if hosts else None,
+            memory,
+        )
 
     def _start(
         self,
@@ -519,6 +576,8 @@ class Shares(SchedulerPlugin):
         bounds = held.bounds
         slots = task.resource_restrictions[queue.name]
         allowed = None
+        if bounds.is_isolated:
+            return self._empty_worker(queue, held)
         if bounds is not _ANY_WORKER and bounds.is_restricted:
             allowed = self.scheduler.valid_workers(task) or ()
         if queue.with_room:
@@ -556,6 +615,33 @@ class Shares(SchedulerPlugin):
         if len(candidates) <= 1:
             return candidates[0] if candidates else None
         return earliest_worker(self.scheduler, task, candidates)
+
+    def _empty_worker(self, queue: PartitionQueue, held: _HeldTask) -> Any:
+        """Return a worker without other tasks, or None after one was chosen that will be."""
+        key = held.task.key
+        slots = held.task.resource_restrictions[queue.name]
+        allowed = self.scheduler.valid_workers(held.task) if held.bounds.is_restricted else None
+        candidates = [
+            worker
+            for worker in queue.loads
+            if (allowed is None or worker in allowed)
+            and can_run(self.scheduler, worker, queue.name, slots)
+        ]
+        other = None
+        if queue.cleared is not None and queue.cleared[1] != key:
+            other = queue.cleared[0]
+        for worker in candidates:
+            # `processing` lacks tasks that are being assigned, and `used` those that lend slots.
+            is_empty = not worker.processing and not queue.loads[worker].used
+            if is_empty and worker is not other:
+                return worker
+        if candidates and other is None and key in queue.held:
+            loads = queue.loads
+            best = min(candidates, key=lambda worker: loads[worker].seconds)
+            current = queue.cleared[0] if queue.cleared is not None else None
+            if current not in candidates or loads[best].seconds < loads[current].seconds:
+                queue.clear_worker(best, key)
+        return None
 
     def _worker_for_tied(self, queue: PartitionQueue, task: Any, slots: float, allowed: Any) -> Any:
         """Return a worker on which a nested or bound task should wait, or None."""
@@ -642,13 +728,13 @@ class Shares(SchedulerPlugin):
         """Assign held tasks to workers with room, as long as there are both."""
         self._is_dispatch_due = False
         for queue in self.queues.values():
-            if queue.held and (queue.with_room or queue.tied_held):
+            if queue.held and (queue.with_room or queue.held_without_room):
                 self._dispatch_from(queue)
 
     def _dispatch_from(self, queue: PartitionQueue) -> None:
         chosen: list[Any] = []
         now = time.monotonic()
-        while queue.held and (queue.with_room or queue.tied_held):
+        while queue.held and (queue.with_room or queue.held_without_room):
             queue.reserved = None
             found = self._next_task(queue)
             if found is None:
@@ -667,7 +753,7 @@ class Shares(SchedulerPlugin):
         passed_over: list[str] = []
         for client in queue.policy.clients_in_turn():
             for held in queue.heads(client):
-                if not (queue.with_room or held.bounds.is_tied):
+                if not (queue.with_room or held.bounds.needs_no_room):
                     continue
                 worker = self._worker_for(queue, held)
                 if worker is not None:
@@ -711,20 +797,6 @@ class Shares(SchedulerPlugin):
             if queue.loads:  # otherwise, there are no workers
                 refresh_waiting_times(self.scheduler, (h.task for h in queue.held.values()))
         self._dispatch_soon()
-
-
-def _bounds_of(task: Any) -> _Bounds:
-    workers, hosts = task.worker_restrictions, task.host_restrictions
-    is_tied = bool(workers) or submitter_of(task) is not None
-    memory = memory_of(task)
-    if not (is_tied or hosts or memory):
-        return _ANY_WORKER
-    return _Bounds(
-        is_tied,
-        frozenset(workers) if workers else None,
-        frozenset(hosts) if hosts else None,
-        memory,
-    )
 
 
 def submitter_of(task: Any) -> SubmittingTask | None:

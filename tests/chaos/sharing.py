@@ -165,7 +165,7 @@ class Arena(WorkerProcesses):
         shares = scheduler.plugins[poolpart.shares.NAME]
         for queue in [*shares.queues.values()]:
             counts = {name: len(getattr(queue, name)) for name in ("held", "assigned", "heaps")}
-            counts["tied"] = queue.tied_held
+            counts["without room"] = queue.held_without_room
             found += [f"{count} {name}" for name, count in counts.items() if count]
             found += [f"{w.name}: {load}" for w, load in [*queue.loads.items()] if load.used]
             for name, account in [*queue.policy.accounts.items()]:

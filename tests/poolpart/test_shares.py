@@ -7,7 +7,7 @@ from contextlib import ExitStack
 
 import dask
 import pytest
-from distributed import Client, Event, wait
+from distributed import Client, Event, get_worker, wait
 from tests.poolpart.helpers import LONG_S, addresses, kill, metrics_of, wait_for, worker_name
 
 from poolpart import Partition, Pool, PoolError, rest
@@ -357,6 +357,51 @@ def test_tasks_that_run_before_the_partition_is_used_count(start, wait_until):
     assert (stats.slots, stats.waiting) == (1, 1)
     Event("gate", client).set()
     assert client.gather([*futures, last]) == [True, True, 1]
+
+
+def most_executing(*_):
+    """Return how many tasks this worker has run at the same time."""
+    state = get_worker().state
+    counts = []
+    for _ in range(5):
+        counts.append(len(state.executing))
+        time.sleep(0.01)
+    return max(counts)
+
+
+def test_an_isolated_task_gets_a_worker_of_its_own_in_its_turn(start, wait_until):
+    """The slots of each worker are otherwise never free at the same time."""
+    client = start({name: {"resources": {"P": 2}, "nthreads": 2} for name in "xy"})
+    alice = Partition("P", client)
+    with Client(client.cluster, name="bob") as other:
+        bob = Partition("P", other)
+        blockers = [bob.submit(wait_for, "first gate", key=f"blocker-{n}") for n in range(4)]
+        wait_until(lambda: bob.stats().running == 4)
+        backlog = [bob.submit(run, "bob") for _ in range(150)]
+        shares = client.cluster.scheduler.plugins[NAME]
+        for number in range(3):
+            shares.isolate(f"isolated-{number}")
+        isolated = [alice.submit(most_executing, key=f"isolated-{n}") for n in range(3)]
+        beside = alice.submit(run, "alice")
+        await_queued(alice, 154)
+        Event("first gate", client).set()
+        assert client.gather(isolated) == [1, 1, 1]
+        beside.result(LONG_S)
+        assert not all(task.done() for task in backlog)
+        wait([*blockers, *backlog], timeout=LONG_S)
+        # A worker is kept free for a task, which is canceled.
+        running = [bob.submit(wait_for, "gate", workers=name) for name in "xy"]
+        wait_until(lambda: bob.stats().running == 2)
+        shares.isolate("canceled")
+        waiting = alice.submit(most_executing, key="canceled")
+        await_queued(alice, 1)
+        running += [bob.submit(wait_for, "gate", key="third")]
+        wait_until(lambda: bob.stats().running == 3)
+        alice.cancel(waiting)
+        running += [bob.submit(wait_for, "gate", key="fourth")]
+        wait_until(lambda: bob.stats().running == 4)
+        Event("gate", client).set()
+        assert all(other.gather(running))
 
 
 @pytest.mark.extended

@@ -219,3 +219,79 @@ def test_only_the_task_that_blocks_its_worker_fails(nannies, monkeypatch, tmp_pa
         blocker.result(LONG_S)
     assert nannies.gather(others) == [0.8] * 6
     assert len((tmp_path / "held").read_text().split()) <= 4
+
+
+def delay_report_once(path):
+    """Keep this worker from reporting that the task has finished, unless it runs again."""
+    if not path.exists():
+        path.touch()
+        get_worker().batched_stream.next_deadline = time.time() + 3600
+
+
+@pytest.mark.extended
+def test_a_task_behind_others_fails_if_it_blocks_its_worker(nannies, monkeypatch, tmp_path):
+    """The worker cannot report that the tasks before it have finished, which have no limit."""
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 1.0)
+    monkeypatch.setattr("poolpart.extras.watching.SILENT_S", 3.0)
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=1, slots=1)
+    finished = tmp_path / "finished"
+    finished.touch()  # so that tasks are expected to be short, and are assigned in advance
+    nannies.gather([both.submit(delay_report_once, finished) for _ in range(5)])
+    first = both.submit(delay_report_once, tmp_path / "first")
+    blocker = both.submit(hold_interpreter, tmp_path / "held", timeout_s=1.0)
+    with pytest.raises(TaskTimeoutError):
+        blocker.result(LONG_S)
+    first.result(LONG_S)
+    assert len((tmp_path / "held").read_text().split()) == 2
+
+
+@pytest.mark.extended
+def test_results_of_a_blocked_worker_are_computed_again(nannies, monkeypatch, tmp_path):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 1.0)
+    monkeypatch.setattr("poolpart.extras.watching.SILENT_S", 3.0)
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    one, _ = Pool.from_client(nannies).partition("P", n_workers=1, slots=1)
+    held = one.submit(os.getpid)
+    pid = held.result(LONG_S)
+    with pytest.raises(TaskTimeoutError):
+        one.submit(hold_interpreter, tmp_path / "held", timeout_s=1.0).result(LONG_S)
+    assert one.submit(abs, held).result(LONG_S) != pid
+
+
+def process():
+    return os.getpid(), get_worker().address
+
+
+def set_own_status(status, dask_worker):
+    dask_worker.status = status
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("resumes", [True, False])
+def test_a_paused_worker_whose_task_does_not_return_is_restarted(nannies, monkeypatch, resumes):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
+    monkeypatch.setattr("poolpart.extras.watching.RETRY_S", 0.5)
+    one, _ = Pool.from_client(nannies).partition("P", n_workers=1, slots=1)
+    pid, address = one.submit(process).result(LONG_S)
+    hung = one.submit(sleep_for, 3600, timeout_s=1.0)
+    while one.stats().running < 1:
+        time.sleep(0.01)
+    nannies.run(set_own_status, Status.paused, workers=[address])
+    with pytest.raises(TaskTimeoutError):
+        hung.result(LONG_S)
+    if resumes:
+        nannies.run(set_own_status, Status.running, workers=[address])
+    assert one.submit(process).result(LONG_S)[0] != pid
+
+
+@pytest.mark.extended
+def test_a_worker_with_two_tasks_that_do_not_return_is_restarted(nannies, monkeypatch):
+    monkeypatch.setattr("poolpart.extras.watching.ANSWER_S", 0.3)
+    one, _ = Pool.from_client(nannies).partition("P", n_workers=1, slots=2)
+    pid = one.submit(os.getpid).result(LONG_S)
+    hung = [one.submit(sleep_for, 3600, timeout_s=limit_s) for limit_s in (0.5, 1.5)]
+    for task in hung:
+        with pytest.raises(TaskTimeoutError):
+            task.result(LONG_S)
+    assert one.submit(os.getpid).result(LONG_S) != pid

@@ -173,9 +173,11 @@ async def free_worker(
         Time in seconds to wait until other running tasks have finished.
     """
     running = f"running: worker {worker.name}"
-    if worker.status is not Status.running:
+    if worker.status not in (Status.running, Status.paused):
         return f"{running} is {worker.status.name}"
-    stop_assigning(scheduler, worker)
+    was_running = worker.status is Status.running  # a paused worker gets no tasks anyway
+    if was_running:
+        stop_assigning(scheduler, worker)
     try:
         load = await _hand_over(scheduler, worker, name, candidates)
         deadline = time.monotonic() + patience_s
@@ -183,24 +185,30 @@ async def free_worker(
             await asyncio.sleep(_CHECK_S)
             load = await request_load(scheduler, worker)
         if load is not None and ended.isdisjoint(load.running):
-            resume_assigning(scheduler, worker)
+            _resume(scheduler, worker, was_running)
             return "ended"
         recompute = recompute or (recompute_if_silent and load is None)
         obstacle = await _obstacle(scheduler, worker, name, load, ended, candidates, recompute)
     except Exception:
-        resume_assigning(scheduler, worker)
+        _resume(scheduler, worker, was_running)
         raise
     if obstacle:
-        if load is None:
+        if load is None and was_running:
             _start(_resume_when_responding(scheduler, worker))
         else:
-            resume_assigning(scheduler, worker)
+            _resume(scheduler, worker, was_running)
         return running + obstacle
     # Dask would count the death of the worker against these tasks.
     reschedule_tasks(scheduler, list(worker.processing))
     if await _await_for(restart_worker(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
     return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
+
+
+def _resume(scheduler: Any, worker: Any, was_running: bool) -> None:
+    """Assign tasks to a worker again, unless it was paused before."""
+    if was_running:
+        resume_assigning(scheduler, worker)
 
 
 async def await_end(scheduler: Any, worker: Any, key: Any, seconds: float) -> bool:

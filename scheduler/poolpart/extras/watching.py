@@ -12,8 +12,8 @@ is restarted if the function does not return (see `cancelling.free_worker`).
 The scheduler learns from heartbeats which tasks a worker runs, and since when. Workers in a small
 cluster send two heartbeats per second. If they are late, the scheduler asks the worker. A worker
 that does not respond may be blocked by any of its tasks, and may have finished others without being
-able to report it. It is restarted, and the tasks that it may have been running run again, each on a
-worker of its own. Only a task that is alone on its worker is known to block it, and fails.
+able to report it. It is restarted, and all of its tasks run again, each on a worker of its own.
+Only a task that is alone on its worker is known to block it, and fails.
 """
 
 from __future__ import annotations
@@ -103,7 +103,13 @@ class TaskWatch:
                     recount_used_resources(worker)
             free = {worker: _free_slots(worker, name) for worker in members}
             free = {worker: slots for worker, slots in free.items() if slots > 0}
-            usable = {worker: n for worker, n in free.items() if worker in self.scheduler.running}
+            shares = self.scheduler.plugins.get(SHARES)
+            usable = {
+                worker: slots
+                for worker, slots in free.items()
+                if worker in self.scheduler.running
+                and not (shares is not None and shares.keeps_free(worker))
+            }
             if usable:
                 self._move_late_tasks(name, members, usable, waiting)
         self._tried = {task: at for task, at in self._tried.items() if task in self._waiting}
@@ -185,8 +191,10 @@ class TaskWatch:
         """
         silent_s = time.time() - worker.last_seen
         running = {task: seconds + silent_s for task, seconds in worker.executing.items()}
-        if silent_s > SILENT_S:  # a task may have started after the last heartbeat
-            for task in running_candidates(worker) - running.keys():
+        # A task may have started after the last heartbeat, and the worker may have been unable to
+        # report that the tasks before it have finished.
+        if silent_s > SILENT_S:
+            for task in worker.processing - running.keys():
                 running[task] = silent_s - SILENT_S
         return {t: s for t, s in running.items() if self._is_late(name, worker, t, s)}
 
@@ -217,22 +225,23 @@ class TaskWatch:
     async def _free_blocked(self, name: str, worker: Any) -> None:
         """Restart a worker that does not respond, and let a task fail if it is the only cause."""
         late = self._possibly_late(name, worker)
-        candidates = running_candidates(worker)
+        assigned = [*worker.processing]
         reported = [task for task in late if task in worker.executing or task in self._blocked]
-        is_alone = len(worker.processing) == 1
+        is_alone = len(assigned) == 1
         causes = [t for t in reported if is_alone or self._blocked[t] >= MOST_BLOCKED]
         if causes:
             for task in causes:
                 self._end_soon(name, worker, task, late[task])
         elif late:
             shares = self.scheduler.plugins.get(SHARES)
-            for task in candidates:
+            for task in assigned:
                 if shares is not None:
                     shares.isolate(task.key)
-            keys = {task.key for task in candidates}
-            outcome = await self._free(name, worker, set(), keys)
+            candidates = {task.key for task in running_candidates(worker)}
+            outcome = await self._free(name, worker, set(), candidates)
             if outcome.startswith("restarted") or not worker.nanny:
-                self._blocked.update(candidates)
+                self._blocked.update(assigned)
+                keys = {task.key for task in assigned}
                 logger.warning("One of the tasks %s blocks its worker (%s).", keys, outcome)
 
     def _end_soon(self, name: str, worker: Any, task: Any, seconds: float) -> None:

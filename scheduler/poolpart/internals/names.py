@@ -212,6 +212,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}.valid_workers(ts)",
             f"{_STEALING}.move_task_request(ts, victim, thief)",
             f"{_STEALING}.in_flight",
+            f"{_SCHEDULER_WORKER}.processing",
         ),
         "hold tasks back until a slot and enough memory are free; let clients take turns",
         (
