@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lidarfiles.work import work
 from lidarpool.cli.commands import cli
-from lidarreal.augmentation import running
 from lidarsim import LidarError
 
 VOXELS = "sequences/00/voxels/000000.bin"
@@ -72,7 +72,7 @@ def test_existing_outputs_are_reported_before_inputs_are_read(command, existing)
 
 def test_an_existing_augmentation_is_reported_before_the_recording_is_hashed(monkeypatch):
     hashed = []
-    monkeypatch.setattr(running, "fingerprint_files", lambda path: hashed.append(path) or "hash")
+    monkeypatch.setattr(work, "fingerprint_files", lambda path: hashed.append(path) or "hash")
     Path("drive").mkdir()
     np.ones((40, 4), "<f4").tofile("drive/000000.bin")
     command = "augment drive --out wet --rain 5 --workers 1 --quiet"

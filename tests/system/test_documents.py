@@ -705,7 +705,7 @@ def test_files_that_the_architecture_names_exist():
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     tree = {
         str(p.relative_to(ROOT))
-        for d in ("kernels", "scheduler", "workflows")
+        for d in ("kernels", "scheduler", "workflows", "tests")
         for p in (ROOT / d).rglob("*")
     }
     named = set(re.findall(r"`([\w/.]+\.(?:py|cu|yaml))(?::[^`]*)?`", text)) - {"scenario.yaml"}

@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 
-from lidarfiles.plugins import Cloud, FormatRow, MultiFileFormat, Recording, RecordingSource, Sweep
+from lidarpool.plugins import Cloud, FormatRow, MultiFileFormat, Recording, RecordingSource, Sweep
 
 
 class SweepFolder(MultiFileFormat):

@@ -9,7 +9,7 @@ import click
 @click.argument("result", type=click.Path(path_type=Path))
 def highest(result: Path) -> None:
     """Print the height of the highest point in a result."""
-    from lidarfiles import read_cloud  # imported here to keep --help fast
+    from lidarpool import read_cloud  # imported here to keep --help fast
 
     cloud = read_cloud(result / "cloud.ply")
     click.echo(f"{cloud.bounds[1, 2]:.2f} m")
