@@ -206,7 +206,7 @@ def test_nested_tasks_use_the_memory_of_the_waiting_task(part):
     while part.stats().running < 2:
         time.sleep(0.01)
     with Client(part.client.cluster, name="bob") as bob:
-        other = Partition("P", bob).submit(hold, 2, 2, memory="2 GiB")
+        other = Partition("P", bob).submit(hold, 2, 5, memory="5 GiB")
         gate.set()
         assert part.client.gather(parents) == [1, 1]
         assert other.result(LONG_S) == 2
