@@ -35,6 +35,14 @@ def options(**others):
     return {"resources": {"P": 4}, "nthreads": 4, "memory_limit": "9 GiB", **others}
 
 
+@pytest.fixture(autouse=True)
+def _unpaused():
+    """Do not pause workers, which are threads of this process and measure its memory."""
+    limits = ("target", "spill", "pause")
+    with dask.config.set({f"distributed.worker.memory.{name}": False for name in limits}):
+        yield
+
+
 @pytest.fixture
 def cluster(start, monkeypatch):
     """Start one worker, which has memory for two tasks of `HALF`; return the client.
