@@ -182,6 +182,7 @@ def test_the_card_counts_jobs_in_which_a_quantity_is_not_set(tmp_path):
     assert "| `visibility` | not set |" in (tmp_path / "README.md").read_text()
 
 
+@pytest.mark.extended
 def test_letters_of_users_are_escaped(tmp_path):
     names = (EVIL, "a")
     rows = [

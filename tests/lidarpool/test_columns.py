@@ -326,6 +326,7 @@ def test_normals_and_origins_in_the_sensors_axes(cluster_client):
         )
 
 
+@pytest.mark.extended
 def test_what_is_no_surface_has_neither_normal_nor_incidence(cluster_client):
     survey = Survey(
         Sensor.grid(720, 16, 30.0, step_deg=360), poses=[(0, 0, 1)], steps=1, rain_mm_h=80,

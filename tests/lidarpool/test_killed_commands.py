@@ -541,6 +541,7 @@ def kills(request, tmp_path, monkeypatch):
     return made
 
 
+@pytest.mark.extended(keep=("twin", "augment", "mount", "stations", "compare", "export", "folder"))
 def test_a_killed_command_leaves_one_result_or_visibly_none_and_is_continued(kills):
     step = max(kills.changes // POSITIONS, 1)
     left = [kills.kill(position) for position in range(0, kills.changes, step)]

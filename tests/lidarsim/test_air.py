@@ -96,6 +96,7 @@ def test_dust_takes_and_returns_in_proportion_to_its_mass():
     assert found["intensity"][0] == pytest.approx(0.5 / 36 * math.exp(-2 * 0.0012 * 60))
 
 
+@pytest.mark.extended
 def test_what_the_air_takes_is_not_in_the_reflectance():
     weather = {"visibility_km": 0.5, "rain_mm_h": 10, "snow_mm_h": 0.1, "dust_mg_m3": 1}
     # What returns from less than half of the range is too little to be detected.

@@ -226,6 +226,7 @@ def test_a_film_stays_on_what_faces_up(mesh, ratio):
     assert wet / dry == pytest.approx(share)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "options",
     [

@@ -26,6 +26,7 @@ def undisturbed(cluster_client):
     return simulate(Scene.seed(), SURVEY, client=cluster_client)
 
 
+@pytest.mark.extended
 def test_frames_come_in_order_and_every_scan_once(
     client, undisturbed, same_cloud, all_records, left_over
 ):
