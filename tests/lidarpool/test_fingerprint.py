@@ -250,7 +250,7 @@ def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_n
 @pytest.mark.extended
 def test_a_process_older_than_its_files_does_not_speak_for_them(packages):
     late = time.time() + 3600
-    os.utime(packages / "lidarsim" / "simulator" / "returns.py", (late, late))
+    os.utime(packages / "lidarsim" / "pulses" / "returns.py", (late, late))
     assert asked(packages) == "changed since the process started"
 
 

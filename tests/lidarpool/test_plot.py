@@ -167,7 +167,9 @@ def test_the_cloud_is_colored_by_any_of_its_columns(unplanned, tmp_path, monkeyp
     columns = {"scan": zeros, "channel": zeros, "object": zeros + 1, "wetness": wetness}
     save_cloud(Cloud(positions, columns, [wet]), result / "cloud.ply")
     figures = []
-    monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
+    monkeypatch.setattr(
+        Page, "save", lambda page, path: path.touch() or figures.append(page.figure)
+    )
     for name in ("z", "wetness", "object", "ring", "x", "y"):
         plot(result, "--only", "cloud", "--color", name, *SMALL)
     assert [figure.axes[0].get_ylabel() for figure in figures[:2]] == ["z (m)", "wetness (%)"]

@@ -159,6 +159,6 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
         assert np.array_equal(cloud[column.name], made), column.name
     on = cloud["object"] == len(scene.names) + 1
     assert set(cloud["class"][on]) == {2}
-    assert set(cloud["class"][cloud["object"] < len(scene.names)]) == {0}
+    assert set(cloud["class"][cloud["object"] < len(scene.names)]) == {0, 1}  # and parked cars
     assert np.array_equal(np.unique(cloud["sensor"]), [0, 1])
     assert (np.diff(cloud["scan"]) >= 0).all()
