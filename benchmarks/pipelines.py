@@ -17,7 +17,7 @@ is installed in an environment of its own:
 
     python3 -m venv build/ray && build/ray/bin/pip install "ray[data]==2.60.0"
 
-Without `build/ray`, or the interpreter that `--ray-python` names, its rows are left out.
+Pass another interpreter with `--ray-python`. If it does not exist, Ray Data is skipped.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class User(Child):
 
 
 class Memory(threading.Thread):
-    """Maximum of the memory that processes and their children use together, in bytes."""
+    """Thread that records the peak memory of processes and their children, in bytes."""
 
     def __init__(self, *pids: int) -> None:
         super().__init__(daemon=True)
@@ -353,7 +353,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
         for program in options.only
     }
     if not Path(options.ray_python).exists():
-        print(f"Ray Data is left out, because {options.ray_python} does not exist (see --help).")
+        print(f"Skipping Ray Data: {options.ray_python} does not exist. Pass `--ray-python`.")
         pythons = {name: python for name, python in pythons.items() if name[:3] != "ray"}
     rounds: dict[str, list[dict[str, float]]] = {program: [] for program in pythons}
     for number in range(options.repeat):

@@ -7,6 +7,7 @@ worker has enough memory for them (see `shares.py`).
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any
 
 from dask.utils import parse_bytes
@@ -46,10 +47,8 @@ def _to_bytes(memory: object) -> int:
     """Return an amount of memory that a user has passed in bytes."""
     number: float = 0.0
     if isinstance(memory, str) and memory.strip()[-1:].isalpha() and any(map(str.isdigit, memory)):
-        try:
+        with suppress(ValueError, OverflowError):
             number = parse_bytes(memory)
-        except (ValueError, OverflowError):
-            number = 0.0
     elif _is_number(memory):
         number = memory  # type: ignore[assignment]
     if not 1 <= number < math.inf:

@@ -266,7 +266,7 @@ class Registrations(SchedulerPlugin):
             divided_on = str(self.scheduler.id) if name in self.with_rule else ""
             objection = rejection_reason(self.scheduler, name, slots, divided_on)
             if not objection and memory:
-                objection = memory_objection(self.scheduler, name, slots, memory)
+                objection = memory_rejection_reason(self.scheduler, name, slots, memory)
             if objection:
                 raise PoolError(objection)
 
@@ -442,7 +442,7 @@ def rejection_reason(scheduler: Any, name: str, slots: float, divided_on: str) -
     )
 
 
-def memory_objection(scheduler: Any, name: str, slots: float, memory: int) -> str:
+def memory_rejection_reason(scheduler: Any, name: str, slots: float, memory: int) -> str:
     """Return why no worker of a partition could run a task with so much memory, or "".
 
     Members that are restarting count. If there are no members with enough slots, the task waits.

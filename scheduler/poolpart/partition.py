@@ -246,8 +246,9 @@ class Partition:
             runs longer fails with `TaskTimeoutError`, or runs again on another worker if it has
             `retries` left. It is checked about twice a second. If the function does not return
             within 5 s, for example because it does not check `cancelled`, its worker is restarted
-            under the conditions of ``cancel(running="restart")``. The restart waits up to a minute
-            for other tasks on the worker to finish.
+            under the conditions of ``cancel(running="restart")``. The first attempt waits up to a
+            minute for other tasks on the worker to finish, and further attempts follow every 15 s.
+            If the worker does not respond, its results may be computed again.
         memory
             Memory that the task holds on its worker while it runs, as a string such as "2 GiB" or
             as a number of bytes. The tasks on a worker hold at most its memory limit in total, so
@@ -566,8 +567,14 @@ class Partition:
         36
         """
         limit_annotations(timeout_s, memory)  # raises an error here rather than in a thread
-        options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
-        options |= {"timeout_s": timeout_s, "memory": memory}
+        options = {
+            "priority": priority,
+            "retries": retries,
+            "slots": slots,
+            **kwargs,
+            "timeout_s": timeout_s,
+            "memory": memory,
+        }
         _check_function(self.name, function)
         _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._resources_for(slots)

@@ -575,10 +575,10 @@ class Shares(SchedulerPlugin):
         task = held.task
         bounds = held.bounds
         slots = task.resource_restrictions[queue.name]
-        allowed = None
         if bounds.is_isolated:
             return self._empty_worker(queue, held)
-        if bounds is not _ANY_WORKER and bounds.is_restricted:
+        allowed = None
+        if bounds.is_restricted:
             allowed = self.scheduler.valid_workers(task) or ()
         if queue.with_room:
             worker = self._worker_with_room(queue, task, slots, allowed)

@@ -108,7 +108,7 @@ class StallMonitor(SchedulerPlugin):
     def _state(self, unfinished: list[Any]) -> str:
         now = time.time()
         workers = [
-            f"{w.name} {w.status.name}, heard of {now - w.last_seen:.1f} s ago, "
+            f"{w.name} {w.status.name}, last heartbeat {now - w.last_seen:.1f} s ago, "
             f"{len(w.processing)} tasks, {len(w.executing)} running"
             for w in [*self.scheduler.workers.values()]
         ]
@@ -118,7 +118,7 @@ class StallMonitor(SchedulerPlugin):
         return "; ".join([*workers, *(f"{n} {state}" for state, n in states.items()), *self.faults])
 
     def stop(self) -> None:
-        """Stop to look for stalls."""
+        """Stop looking for stalls."""
         self._stop.set()
         self._thread.join()
 

@@ -75,7 +75,7 @@ def children(item: str) -> list[str]:
 
 
 def nested(item: str, folder: Path) -> int:
-    """Process the children of an item in tasks that this task waits for."""
+    """Process the children of an item in nested tasks, and wait for them."""
     client = get_client()
     futures = [client.submit(work, child, folder, pure=False) for child in children(item)]
     return sum(client.gather(futures))
@@ -231,12 +231,12 @@ def _with_item(item: str, folder: Path) -> tuple[str, int]:
 
 
 def phase_of(folder: Path) -> str:
-    """Return the present phase."""
+    """Return the current phase."""
     return (folder / "phase.txt").read_text()
 
 
 def set_phase(folder: Path, phase: str) -> None:
-    """Change the phase at once, as seen by readers."""
+    """Change the phase atomically."""
     (folder / "next-phase.txt").write_text(phase)
     (folder / "next-phase.txt").rename(folder / "phase.txt")
 

@@ -327,7 +327,7 @@ def test_holes_in_the_side_of_an_object_remain_and_the_rest_is_closed():
 
 @pytest.mark.parametrize("is_labeled", [True, False])
 def test_labeled_objects_keep_their_tracks_without_points(is_labeled):
-    """A box without any points is of no object, but its points are not of the scene."""
+    """A labeled box without points has no object. Points inside it are left out of the scene."""
     track, rays = box_sides()
     apart = replace(track, number=6, positions=track.positions + np.array([40.0, 0, 0]))
     found = ObjectMap.from_task(

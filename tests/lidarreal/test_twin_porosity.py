@@ -44,7 +44,7 @@ def test_gap_fractions_are_the_share_of_the_rays_that_pass():
 
 @pytest.mark.parametrize("passing", [0, 24, 45])
 def test_few_rays_have_the_gaps_of_the_surfels_around(passing):
-    """In 20 places, 60 rays meet each of 8 surfels, and both rays to a ninth end on it."""
+    """A surfel with two rays gets the gaps of its eight neighbors, which have 60 rays each."""
     places, many = 20, 8
     surfel = np.repeat(np.arange(places * many, dtype=np.int32), 60)
     surfel = np.append(surfel, np.repeat(np.arange(places, dtype=np.int32), 2) + places * many)

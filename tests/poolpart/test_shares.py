@@ -370,7 +370,7 @@ def most_executing(*_):
 
 
 def test_an_isolated_task_gets_a_worker_of_its_own_in_its_turn(start, wait_until):
-    """The slots of each worker are otherwise never free at the same time."""
+    """Without a reserved worker, the slots of a worker would never be free at the same time."""
     client = start({name: {"resources": {"P": 2}, "nthreads": 2} for name in "xy"})
     alice = Partition("P", client)
     with Client(client.cluster, name="bob") as other:

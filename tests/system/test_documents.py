@@ -129,7 +129,11 @@ def test_no_code_is_overlooked():
 
 @pytest.fixture
 def in_threads(monkeypatch, cluster_client):
-    """Give programs clusters of threads: the tests' own, or one that they describe."""
+    """Give programs clusters of threads: the tests' own, or one that they describe.
+
+    Their workers would be paused if this process, whose memory they measure, were above a limit.
+    """
+    monkeypatch.setitem(dask.config.config["distributed"]["worker"]["memory"], "pause", False)
     theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
     monkeypatch.setattr(distributed, "LocalCluster", theirs)
     ours = nullcontext(cluster_client)

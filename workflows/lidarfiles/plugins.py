@@ -1,4 +1,4 @@
-"""Public classes for plug-ins that read or write point clouds, which `lidarpool.plugins` has too.
+"""Public classes for plug-ins that read or write point clouds.
 
 See docs/how-to/plugins.md for an example.
 """

@@ -1,32 +1,9 @@
 """Public classes for plug-ins that read or write point clouds.
 
-See docs/how-to/plugins.md for an example.
+See docs/how-to/plugins.md for an example. The names are those of `lidarfiles.plugins`.
 """
 
-from lidarfiles.plugins import (
-    Cloud,
-    CloudFormat,
-    CloudLike,
-    ExportSpec,
-    FormatRow,
-    MultiFileFormat,
-    PointField,
-    Recording,
-    RecordingSource,
-    Sweep,
-    Sweeps,
-)
+from lidarfiles import plugins
+from lidarfiles.plugins import *  # noqa: F403
 
-__all__ = [
-    "Cloud",
-    "CloudFormat",
-    "CloudLike",
-    "ExportSpec",
-    "FormatRow",
-    "MultiFileFormat",
-    "PointField",
-    "Recording",
-    "RecordingSource",
-    "Sweep",
-    "Sweeps",
-]
+__all__ = plugins.__all__

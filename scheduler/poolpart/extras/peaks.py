@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-import psutil
 from dask.utils import key_split
 from tornado.ioloop import PeriodicCallback
 
@@ -31,7 +30,6 @@ class PeakMemory:
         self._worker = worker
         self._name = name
         self._sent: dict[str, int] = {}  # {stage: memory in bytes}
-        self._process = psutil.Process()
         self._sampled_at = 0.0  # time.monotonic()
         self._timer = PeriodicCallback(self._sample, 1000 * SAMPLE_S)
         self._timer.start()
@@ -57,7 +55,7 @@ class PeakMemory:
         if not stages:
             return
         self._sampled_at = time.monotonic()
-        memory = self._process.memory_info().rss
+        memory = self._worker.monitor.get_process_memory()
         for stage in stages:
             if memory > GROWTH * self._sent.get(stage, 0):
                 self._sent[stage] = memory

@@ -10,10 +10,11 @@ A task that runs longer than its `timeout_s` fails. Dask does not stop its funct
 is restarted if the function does not return (see `cancelling.free_worker`).
 
 The scheduler learns from heartbeats which tasks a worker runs, and since when. Workers in a small
-cluster send two heartbeats per second. If they are late, the scheduler asks the worker. A worker
-that does not respond may be blocked by any of its tasks, and may have finished others without being
-able to report it. It is restarted, and all of its tasks run again, each on a worker of its own.
-Only a task that is alone on its worker is known to block it, and fails.
+cluster send two heartbeats per second. If a task may have exceeded its limit according to the last
+heartbeat, the scheduler asks the worker. A worker that does not respond may be blocked by any of
+its tasks, and may have finished others without being able to report it. It is restarted, and all of
+its tasks run again, each on a worker of its own. A task fails if it was alone on its worker, or if
+it may have blocked more than three workers.
 """
 
 from __future__ import annotations
@@ -48,12 +49,10 @@ logger = logging.getLogger(__name__)
 
 WATCH_S = 0.5  # interval between checks
 LATE_S = 0.9  # time after which a task that waits on a worker is moved to a free slot
-SILENT_S = 5.0  # time without a heartbeat after which a worker is assumed to be blocked by a task
+SILENT_S = 5.0  # time without a heartbeat after which unreported tasks may be running
 PATIENCE_S = 60.0  # time for other tasks to finish before a hung worker is restarted
 RETRY_S = 15.0  # interval between attempts to restart a hung worker
 MOST_BLOCKED = 3  # a task fails if it may have blocked more workers, even if it was not alone
-
-
 _ENDED = "memory", "erred", "released", "forgotten"  # states of tasks
 
 
@@ -311,7 +310,7 @@ class TaskWatch:
         candidates: set[Any],
         patience_s: float = 0.0,
     ) -> str:
-        """Restart a worker unless data would be lost that another task cannot compute again."""
+        """Restart a worker. Its results may be computed again only if it does not respond."""
         return await free_worker(
             self.scheduler,
             worker,

@@ -41,7 +41,7 @@ _STAGED = f"{WRITING}00000000"
 class Inputs:
     """What the result of a command depends on.
 
-    The keys are nouns for messages, such as "recording" or "options".
+    The keys are the names of the inputs in messages, such as "recording" or "options".
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class Work:
         restart: bool = False,
         overwrite: bool = False,
     ) -> Iterator[Work]:
-        """Create or continue the work on a result.
+        """Start or resume the computation of a result.
 
         If the body raises an exception, finished items are kept, and a note about `--resume` is
         added to the exception.
@@ -306,9 +306,9 @@ class Work:
         """Return the folder that contains the stored results of a step."""
         return self._folder / step.name
 
-    def count(self, step: Step | FileStep) -> int:
-        """Return the number of items with stored results."""
-        return sum(1 for _ in self.folder(step).rglob(_MARK))
+    def count(self, step: Step | FileStep, keys: Iterable[str]) -> int:
+        """Return how many of the given items have stored results."""
+        return sum(self._mark(step, key).exists() for key in keys)
 
     def forget(self, step: Step | FileStep, key: str) -> None:
         """Remove the stored results of an item, or of all items whose keys begin with a folder."""

@@ -423,7 +423,7 @@ class _Run:
             for variant in variants  # the sweep is read once
         ]
         keys = [sweep.key for sweep in sweeps]
-        stored = self.work.count(_ENCODE)
+        stored = self.work.count(_ENCODE, keys)
         missing = (len(sweeps) - stored) // len(variants)
         chunk = min(missing // _MIN_TASKS + 1, _TASK_SWEEPS) * len(variants)
         self._show_progress(stored)

@@ -191,7 +191,7 @@ class _Jobs:
     tasks
         Tasks that compute the files.
     identities
-        What the files depend on, for each job.
+        Values that determine the files of each job.
     existing
         Paths of files of the jobs in the output folder.
     notes

@@ -377,7 +377,7 @@ class _Chunk(NamedTuple):
 class _VisibleSides(NamedTuple):
     """Sides of surface samples that are visible from each candidate of a chunk.
 
-    Each side of a surface counts separately, because a thin wall has a side in each room.
+    The two sides of a surface count separately, because they can be in different rooms.
     """
 
     bits: NDArray[np.uint8]  # (c, ceil(2n / 8)): the side of each normal, then the opposite sides

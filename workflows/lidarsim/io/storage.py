@@ -516,9 +516,9 @@ def _flock(handle: int, *, wait: bool) -> None:
 
 @contextmanager
 def replacing_file(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that replaces an existing one when the context exits without an error.
+    """Open a temporary file that replaces the given file when the context exits without an error.
 
-    What killed processes have left for the same file is removed.
+    Temporary files that killed processes have left for the same file are removed.
     """
     path = path.absolute()
     storage = Storage.at(path.parent)

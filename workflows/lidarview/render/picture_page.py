@@ -334,7 +334,7 @@ class Page:
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, with details in the lines below.
+        """Write a title at the top left, with details below it.
 
         Long details are divided at their centered dots.
         """

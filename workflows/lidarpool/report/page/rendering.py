@@ -138,9 +138,9 @@ def _station_marks(result: RunResult, top_view: Squares) -> list[_Mark]:
 
 
 def _north(result: RunResult) -> str:
-    """Return the label of the direction up in the top view.
+    """Return the label of the arrow that points up in the top view.
 
-    It is north only in a coordinate system of the Earth, and y in any other.
+    Only projected coordinate systems define north. In all others, the arrow is the y axis.
     """
     return "N" if result.survey.epsg and result.survey.coordinates == "world" else "y"
 

@@ -73,7 +73,7 @@ def plane_deviations(
     max_distance_m
         Points farther than this from the reference have no counterpart.
     show
-        Called when the planes for a part of the points have been fitted.
+        Called after the planes of each batch of points have been fitted.
     """
     origin = reference.positions.mean(axis=0)
     points = points.relative_to(origin)
