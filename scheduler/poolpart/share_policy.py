@@ -231,7 +231,9 @@ class SharePolicy:
         self._tasks[key] = task
         return task
 
-    def finish(self, key: Any, now: float, seconds: float | None) -> StartedTask | None:
+    def finish(
+        self, key: Any, now: float, seconds: float | None, *, lost: bool = False
+    ) -> StartedTask | None:
         """Correct the charge for a task that has ended, and return the former charge, if any.
 
         Parameters
@@ -240,7 +242,10 @@ class SharePolicy:
             Key of the task and present time.
         seconds
             Measured running time in seconds. None if the task was lost or canceled. In this case,
-            its client is charged for at most the expected time.
+            its client is charged for the time since the task was assigned.
+        lost
+            Whether the task was lost with its worker. In this case, its client is charged for at
+            most the expected time, also if the worker did not respond for longer.
         """
         task = self._tasks.pop(key, None)
         if task is None:
@@ -251,8 +256,8 @@ class SharePolicy:
             self._add_run(account, task, -1)
         if seconds is None or lent:
             used_s = task.earlier_s + (0.0 if task.is_lent else now - task.since)
-            if seconds is None:
-                used_s = min(used_s, max(task.charged_s, 0.0))
+            if lost:
+                used_s = min(used_s, task.expected_s)
         else:
             used_s = seconds
         self._charge(account, task, used_s)

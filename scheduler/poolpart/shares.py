@@ -216,9 +216,11 @@ class PartitionQueue:
         self.assigned[key] = assignment
         self._add_load(assignment, 1)
 
-    def unassign(self, key: Any) -> None:
-        """Remove a task from the load of its worker."""
-        self._add_load(self.assigned.pop(key), -1)
+    def unassign(self, key: Any) -> Any:
+        """Remove a task from the load of its worker, which is returned."""
+        assignment = self.assigned.pop(key)
+        self._add_load(assignment, -1)
+        return assignment.worker
 
     def set_lent(self, key: Any, lent: bool) -> None:
         """Record that a task has lent its slots, or has them back."""
@@ -448,13 +450,14 @@ class Shares(SchedulerPlugin):
 
     def _end(self, queue: PartitionQueue, key: Any, finish: str, report: Mapping[str, Any]) -> None:
         """Charge a client for the time that its task has run."""
-        queue.unassign(key)
+        worker = queue.unassign(key)
+        lost = worker.address not in self.scheduler.workers
         seconds = None
         if finish in ("memory", "erred"):
             spans = report.get("startstops") or ()
             computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
             seconds = sum(computing) if computing else None
-        queue.policy.finish(key, time.monotonic(), seconds)
+        queue.policy.finish(key, time.monotonic(), seconds, lost=lost)
         if queue.held and (queue.with_room or queue.cleared is not None):
             self._dispatch_soon()
 

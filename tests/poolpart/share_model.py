@@ -160,7 +160,7 @@ class SharedPartition:
         for key, (on, user) in list(self.assigned.items()):
             if on == number:
                 del self.assigned[key]
-                self.policy.finish(key, self.time, None)
+                self.policy.finish(key, self.time, None, lost=True)
                 self.policy.add_waiting(user.name, self.time)
         self._dispatch()
 

@@ -6,7 +6,7 @@ import random
 import pytest
 from tests.poolpart.share_model import SharedPartition, User
 
-from poolpart.share_policy import RECENT_S, SharePolicy
+from poolpart.share_policy import RECENT_S, UNKNOWN_S, SharePolicy
 
 WEIGHTS = {"a": 1, "b": 1, "c": 3, "d": 1, "e": 1}
 
@@ -113,6 +113,18 @@ def test_lost_workers_change_no_shares():
     partition.run(400)
     assert deviation(partition, 0, 200, "ac") < 0.15
     assert deviation(partition, 200, 400, "ac") < 0.1
+
+
+@pytest.mark.parametrize(("lost", "seconds"), [(True, UNKNOWN_S), (False, 60.0)])
+def test_only_lost_tasks_are_charged_for_at_most_the_expected_time(lost, seconds):
+    policy = SharePolicy()
+    for client in "ab":
+        policy.add_waiting(client, 0.0)
+        policy.start(client, client, "f", 1, 0.0)
+    policy.charge_running(50.0)
+    policy.finish("a", 60.0, None, lost=lost)
+    assert policy.accounts["a"].tag == pytest.approx(seconds)
+    assert policy.accounts["a"].seconds == pytest.approx(seconds)
 
 
 def test_a_task_does_not_count_while_it_lends_its_slots():
