@@ -4,8 +4,9 @@
 partition in several ways. Meanwhile, workers and clients are killed, workers are paused, and tasks
 hang, block their workers or are canceled. After each run, the clients get a quiet phase in which
 their shares are measured, and the scheduler must have forgotten all tasks at the end. The last line
-of the output states what was lost or doubled, how far the shares were off, and the longest time in
-which no task ended although tasks waited. Runs with the same seed inject the same faults.
+of the output states what was lost or doubled, how much slot time a client owed the others because
+its tasks had hung, how far the shares were off after that, and the longest time in which no task
+ended although tasks waited. Runs with the same seed inject the same faults.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ BETWEEN_S = 0.2, 1.5  # seconds between faults
 PAUSED_S = 0.5, 3.0
 SETTLES_WITHIN_S = 180.0
 SETTLING_S = 3.0  # until tasks with the backlogs of all clients run
+EVEN_S = 0.5  # difference of the accounts of clients whose tasks run in turn
 MEASURED_S = 50 * WORK_S[1]
 TOLERANCE = 0.1
 WAITING = "waiting", "no-worker", "processing"  # states of tasks
@@ -159,6 +161,14 @@ class Arena(WorkerProcesses):
             time.sleep(0.2)
         return []
 
+    def owed_s(self) -> float:
+        """Return how much more of its share a client has used than another one, in seconds."""
+        shares = self.cluster.scheduler.plugins[poolpart.shares.NAME]
+        tags = [
+            a.tag for queue in [*shares.queues.values()] for a in queue.policy.accounts.values()
+        ]
+        return max(tags) - min(tags)
+
     def _residue(self) -> list[str]:
         scheduler = self.cluster.scheduler
         found = [f"task {key}: {task.state}" for key, task in [*scheduler.tasks.items()]]
@@ -184,6 +194,7 @@ class Run:
         self.folder = folder
         self.done: Counter[str] = Counter()  # faults by kind
         self.off = 0.0  # greatest relative deviation of a share
+        self.owed_s = 0.0  # slot time that a client owed the others after the faults
         self._chance = chance
         self._helpers: list[threading.Thread] = []
 
@@ -226,6 +237,12 @@ class Run:
                 return [f"{name} did not settle: {self._last_line(name)}" for name in waiting]
             time.sleep(0.1)
         time.sleep(SETTLING_S)
+        owed_until = time.monotonic() + SETTLES_WITHIN_S
+        while (owed_s := self.arena.owed_s()) > EVEN_S:
+            self.owed_s = max(self.owed_s, owed_s)
+            if time.monotonic() > owed_until:
+                return [f"a client still owes {owed_s:.1f} s"]
+            time.sleep(0.1)
         start = time.monotonic()
         time.sleep(MEASURED_S)
         end = time.monotonic()
@@ -288,7 +305,7 @@ def main(arguments: list[str] | None = None) -> int:
     chance = random.Random(seed)
     done: Counter[str] = Counter()
     verdicts: list[Verdict] = []
-    off = 0.0
+    off = owed_s = 0.0
     began_at = time.monotonic()
     with (
         tempfile.TemporaryDirectory(prefix="chaos-", ignore_cleanup_errors=True) as name,
@@ -303,11 +320,13 @@ def main(arguments: list[str] | None = None) -> int:
             verdicts.append(verdict)
             done += run.done
             off = max(off, run.off)
+            owed_s = max(owed_s, run.owed_s)
             seconds = time.monotonic() - began_at
             state = "sound" if verdict.sound else f"NOT SOUND {verdict}"
             print(
-                f"{seconds:5.0f} s, {done.total()} faults, {verdict.rounds} rounds, shares off by "
-                f"{run.off:.0%}, longest stall {monitor.longest_s:.1f} s, {state}",
+                f"{seconds:5.0f} s, {done.total()} faults, {verdict.rounds} rounds, owed "
+                f"{run.owed_s:.1f} s, shares off by {run.off:.0%}, longest stall "
+                f"{monitor.longest_s:.1f} s, {state}",
                 flush=True,
             )
         stall_s = monitor.longest_s
@@ -321,7 +340,8 @@ def main(arguments: list[str] | None = None) -> int:
     items = sum(verdict.items for verdict in verdicts)
     print(
         f"faults {done.total()} ({faults}) items {items} lost {lost} duplicated {doubled} repeated "
-        f"{repeated} wrong {wrong} shares off by {off:.0%} longest stall {stall_s:.1f} s"
+        f"{repeated} wrong {wrong} owed {owed_s:.1f} s shares off by {off:.0%} longest stall "
+        f"{stall_s:.1f} s"
     )
     sound = all(verdict.sound for verdict in verdicts) and stall_s <= LONGEST_STALL_S
     return 0 if sound else 1
