@@ -63,7 +63,7 @@ from .internals.placing import (
     workers_declaring,
 )
 from .internals.scheduler import SUBMITTER, SubmittingTask, is_moving
-from .limits import memory_of
+from .limits import TIMEOUT, memory_of
 from .partition_stats import ClientStats
 from .share_policy import SharePolicy, has_room
 
@@ -306,6 +306,8 @@ class Shares(SchedulerPlugin):
         self.weights: dict[str, float] = {}
         self._clients: dict[Any, str] = {}  # {task key: name of its client}
         self._assigned_in: dict[Any, PartitionQueue] = {}  # {task key: queue of its partition}
+        # {worker: {key of a canceled task with a time limit: (its annotations, time)}}
+        self.canceled: dict[Any, dict[Any, tuple[Any, float]]] = {}
         self._isolated: set[Any] = set()  # keys of tasks that must not share a worker
         self._chosen: dict[Any, Any] = {}  # {task that is being assigned: its worker}
         # {task with memory: worker to which it may be moved}
@@ -457,7 +459,12 @@ class Shares(SchedulerPlugin):
             spans = report.get("startstops") or ()
             computing = [s["stop"] - s["start"] for s in spans if s["action"] == "compute"]
             seconds = sum(computing) if computing else None
-        queue.policy.finish(key, time.monotonic(), seconds, lost=lost)
+        now = time.monotonic()
+        queue.policy.finish(key, now, seconds, lost=lost)
+        if finish == "released" and not lost:
+            annotations = self.scheduler.tasks[key].annotations
+            if annotations and TIMEOUT in annotations:  # its function may still be running
+                self.canceled.setdefault(worker, {})[key] = annotations, now
         if queue.held and (queue.with_room or queue.cleared is not None):
             self._dispatch_soon()
 
@@ -486,6 +493,8 @@ class Shares(SchedulerPlugin):
         for queue in self.queues.values():
             for state in [state for state in queue.loads if state.address == worker]:
                 queue.forget_worker(state)
+        for state in [state for state in self.canceled if state.address == worker]:
+            del self.canceled[state]
 
     def restart(self, scheduler: Any) -> None:
         """Forget all tasks after `Client.restart`. Clients keep their weights."""

@@ -2,16 +2,18 @@
 
 import os
 import signal
+import threading
 import time
 import urllib.request
 
-from distributed import Event, get_worker
+from distributed import Event, get_client, get_worker
 from distributed.core import Status
 from prometheus_client import parser
 
 from poolpart.workers import worker_identities
 
 LONG_S = 120.0  # longest wait for an immediate event before a test fails
+_connecting = threading.Lock()
 
 
 def worker_name(*_):
@@ -24,7 +26,9 @@ def twice(x):
 
 
 def wait_for(event):
-    return Event(event).wait(LONG_S)
+    with _connecting:  # Dask may return a client that another task is still connecting
+        client = get_client()
+    return Event(event, client).wait(LONG_S)
 
 
 def declared(client):

@@ -6,7 +6,7 @@ import signal
 import time
 
 import pytest
-from distributed import Event, get_worker
+from distributed import Client, Event, get_worker
 from distributed.core import Status
 from tests.poolpart.helpers import LONG_S, set_status, wait_for, worker_name
 
@@ -177,6 +177,25 @@ def test_a_task_that_blocks_its_worker_fails_as_well(nannies, monkeypatch, tmp_p
     # machine may need one more attempt.
     assert len((tmp_path / "stopped").read_text().split()) <= watching.MOST_BLOCKED
     assert nannies.gather([both.submit(abs, -number) for number in range(9)]) == [*range(9)]
+
+
+def start_and_hang(path):
+    path.touch()
+    time.sleep(3600)
+
+
+@pytest.mark.parametrize("block", [start_and_hang, stop_worker])
+def test_a_worker_is_freed_if_the_client_of_a_hung_task_leaves(
+    nannies, wait_until, monkeypatch, tmp_path, block
+):
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    one, _ = Pool.from_client(nannies).partition("P", n_workers=1, slots=1)
+    path = tmp_path / "started"
+    with Client(nannies.scheduler.address) as other:
+        task = Partition("P", other).submit(block, path, timeout_s=1.0)
+        wait_until(path.exists)
+        assert not task.done()
+    assert one.submit(abs, -1).result(LONG_S) == 1
 
 
 def hang_on(name):

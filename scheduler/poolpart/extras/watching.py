@@ -7,7 +7,9 @@ such tasks are moved to free slots with the protocol of work stealing, in which 
 task only if it has not started it.
 
 A task that runs longer than its `timeout_s` fails. Dask does not stop its function, so its worker
-is restarted if the function does not return (see `cancelling.free_worker`).
+is restarted if the function does not return (see `cancelling.free_worker`). The same happens if a
+canceled task still runs when its limit has passed since it was canceled, because its client may
+have been killed.
 
 The scheduler learns from heartbeats which tasks a worker runs, and since when. Workers in a small
 cluster send two heartbeats per second. If a task may have exceeded its limit according to the last
@@ -24,7 +26,8 @@ import heapq
 import logging
 import time
 from collections import Counter
-from collections.abc import Coroutine, Iterable, Set
+from collections.abc import Coroutine, Iterable, Iterator, Set
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -95,6 +98,7 @@ class TaskWatch:
         for name in self._names:
             members = workers_declaring(self.scheduler, name)
             self._end_late_tasks(name, members)
+            self._end_canceled_tasks(name, members)
             for worker in members:
                 # Dask attributes a stolen task to its first worker. Where many tasks wait, this
                 # does not matter.
@@ -207,6 +211,41 @@ class TaskWatch:
             and bool(slots_of(task, name))
         )
 
+    def _end_canceled_tasks(self, name: str, members: Iterable[Any]) -> None:
+        """Restart workers on which a canceled task runs longer than its limit.
+
+        Tasks are also canceled when their client leaves.
+        """
+        shares = self.scheduler.plugins.get(SHARES)
+        if shares is None or not shares.canceled:
+            return
+        now = time.monotonic()
+        for worker in members:
+            canceled = shares.canceled.get(worker, {})
+            for key, (limits, since) in [*canceled.items()]:
+                if now - since > limits[TIMEOUT]:
+                    del canceled[key]
+                    self._start(self._end_canceled(name, worker, key, limits, since))
+            if not canceled:
+                shares.canceled.pop(worker, None)
+
+    async def _end_canceled(
+        self, name: str, worker: Any, key: Any, annotations: Any, since: float
+    ) -> None:
+        load = await request_load(self.scheduler, worker)
+        task = self.scheduler.tasks.get(key)
+        if task is not None and task.processing_on is worker:  # it was submitted again
+            return
+        if load is None:
+            seconds = time.monotonic() - since
+        elif key in load.running:
+            seconds = load.running[key]
+        else:
+            return
+        error = _error(key, worker, seconds, annotations)
+        with self._failing(worker, key):
+            await self._end_function(name, worker, key, annotations, error)
+
     def _forget_question(self, worker: Any, _: object) -> None:
         self._asked.discard(worker)
 
@@ -244,11 +283,7 @@ class TaskWatch:
                 logger.warning("One of the tasks %s blocks its worker (%s).", keys, outcome)
 
     def _end_soon(self, name: str, worker: Any, task: Any, seconds: float) -> None:
-        limit_s = task.annotations[TIMEOUT]
-        error = TaskTimeoutError(
-            f"Task {task.key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
-            f"{limit_s:g} s (`timeout_s`)."
-        )
+        error = _error(task.key, worker, seconds, task.annotations)
         ending = worker, task.key
         self._ending.add(ending)
         request = self._start(self._end(name, worker, task, error))
@@ -256,13 +291,18 @@ class TaskWatch:
 
     async def _end(self, name: str, worker: Any, task: Any, error: TaskTimeoutError) -> None:
         """Let a task fail, and restart its worker if the function does not return."""
-        key = task.key
+        with self._failing(worker, task.key):
+            has_ended = await self._fail(worker, task, error)
+            if not has_ended:
+                await self._end_function(name, worker, task.key, task.annotations, error)
+
+    @contextmanager
+    def _failing(self, worker: Any, key: Any) -> Iterator[None]:
+        """Record that a task has ended for the scheduler, while its function may be running."""
         failed = self._failed.setdefault(worker, set())
         failed.add(key)
         try:
-            has_ended = await self._fail(worker, task, error)
-            if not has_ended:
-                await self._end_function(name, worker, key, task.annotations, error)
+            yield
         finally:
             failed.discard(key)
             if not failed:
@@ -327,6 +367,13 @@ class TaskWatch:
         self._requests.add(request)
         request.add_done_callback(self._requests.discard)
         return request
+
+
+def _error(key: Any, worker: Any, seconds: float, annotations: Any) -> TaskTimeoutError:
+    return TaskTimeoutError(
+        f"Task {key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
+        f"{annotations[TIMEOUT]:g} s (`timeout_s`)."
+    )
 
 
 def slots_of(task: Any, name: str) -> float:
