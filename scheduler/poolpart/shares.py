@@ -108,6 +108,13 @@ class _HeldTask:
     task: Any
 
 
+class _Reservation(NamedTuple):
+    """Worker that is kept for a held task."""
+
+    worker: Any
+    key: Any  # of the task
+
+
 @dataclass(slots=True)
 class _Assignment:
     """Task that is assigned to a worker, with its contribution to the load of the worker."""
@@ -146,10 +153,8 @@ class PartitionQueue:
     loads: dict[Any, _Load] = field(default_factory=dict)  # by worker
     # Workers that have room for a task, starting with the one that has had room the longest.
     with_room: dict[Any, None] = field(default_factory=dict)
-    # Worker whose memory is reserved for a held task, and the key of the task.
-    reserved: tuple[Any, Any] | None = None
-    # Worker that gets no further tasks until a held task has it for itself, and the task's key.
-    cleared: tuple[Any, Any] | None = None
+    reserved: _Reservation | None = None  # other tasks do not get memory of the worker
+    cleared: _Reservation | None = None  # no other task is assigned to the worker
     held_without_room: int = 0  # number of tasks among `held` that need no room
     free_slots: float = 0.0  # number of slots without a task
     _idle_s: float = 0.0  # time until the last change for which slots had no task, times slots
@@ -170,7 +175,7 @@ class PartitionQueue:
         # the worker.
         used = load.used - min(load.tied, 1) if load.tied else load.used
         had_room = worker in self.with_room
-        is_cleared = self.cleared is not None and self.cleared[0] is worker
+        is_cleared = self.cleared is not None and self.cleared.worker is worker
         room = slots and not is_cleared and has_room(slots, used, load.seconds, had_room)
         if bool(room) != had_room:
             if had_room:
@@ -185,18 +190,18 @@ class PartitionQueue:
         if load := self.loads.pop(worker, None):
             self._set_free(load, 0.0)
         self.with_room.pop(worker, None)
-        if self.cleared is not None and self.cleared[0] is worker:
+        if self.cleared is not None and self.cleared.worker is worker:
             self.cleared = None
 
     def clear_worker(self, worker: Any, key: Any) -> None:
         """Keep further tasks off a worker until a held task has it for itself."""
         self._end_clearing()
-        self.cleared = worker, key
+        self.cleared = _Reservation(worker, key)
         self.update_worker(worker)
 
     def _end_clearing(self) -> None:
         if self.cleared is not None:
-            worker, _ = self.cleared
+            worker = self.cleared.worker
             self.cleared = None
             self.update_worker(worker)
 
@@ -267,9 +272,9 @@ class PartitionQueue:
         held = self.held.pop(key, None)
         if held is not None:
             self.held_without_room -= held.bounds.needs_no_room
-            if self.reserved is not None and self.reserved[1] == key:
+            if self.reserved is not None and self.reserved.key == key:
                 self.reserved = None
-            if self.cleared is not None and self.cleared[1] == key:
+            if self.cleared is not None and self.cleared.key == key:
                 self._end_clearing()
             if not self.held:
                 self.heaps.clear()  # entries of canceled tasks would remain
@@ -399,7 +404,7 @@ class Shares(SchedulerPlugin):
         if not self._isolated:
             return False
         cleared = (queue.cleared for queue in self.queues.values())
-        return any(entry is not None and entry[0] is worker for entry in cleared) or any(
+        return any(entry is not None and entry.worker is worker for entry in cleared) or any(
             task.key in self._isolated for task in worker.processing
         )
 
@@ -640,8 +645,8 @@ class Shares(SchedulerPlugin):
             and can_run(self.scheduler, worker, queue.name, slots)
         ]
         other = None
-        if queue.cleared is not None and queue.cleared[1] != key:
-            other = queue.cleared[0]
+        if queue.cleared is not None and queue.cleared.key != key:
+            other = queue.cleared.worker
         for worker in candidates:
             # `processing` lacks tasks that are being assigned, and `used` those that lend slots.
             is_empty = not worker.processing and not queue.loads[worker].used
@@ -650,7 +655,7 @@ class Shares(SchedulerPlugin):
         if candidates and other is None and key in queue.held:
             loads = queue.loads
             best = min(candidates, key=lambda worker: loads[worker].seconds)
-            current = queue.cleared[0] if queue.cleared is not None else None
+            current = queue.cleared.worker if queue.cleared is not None else None
             if current not in candidates or loads[best].seconds < loads[current].seconds:
                 queue.clear_worker(best, key)
         return None
@@ -682,10 +687,8 @@ class Shares(SchedulerPlugin):
         self._settle_moves()
         is_nested = submitter_of(task) is not None
         valid = {worker for worker in valid if memory <= self._free_memory(worker, is_nested)}
-        if queue.reserved is not None and not is_nested:
-            worker, key = queue.reserved
-            if key != task.key:
-                valid.discard(worker)
+        if queue.reserved is not None and queue.reserved.key != task.key and not is_nested:
+            valid.discard(queue.reserved.worker)
         return valid
 
     def _free_memory(self, worker: Any, is_nested: bool) -> int:
@@ -726,7 +729,7 @@ class Shares(SchedulerPlugin):
         ]
         if workers:
             best = max(workers, key=lambda worker: self._free_memory(worker, False))
-            queue.reserved = best, task.key
+            queue.reserved = _Reservation(best, task.key)
 
     # -- dispatching -------------------------------------------------------------------
 

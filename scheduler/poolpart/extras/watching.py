@@ -28,7 +28,6 @@ import time
 from collections import Counter
 from collections.abc import Coroutine, Iterable, Iterator, Set
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 from ..errors import TaskTimeoutError
@@ -184,8 +183,7 @@ class TaskWatch:
                     self._end_soon(name, worker, task, seconds)
             if worker not in self._asked and self._possibly_late(name, worker):
                 self._asked.add(worker)
-                request = self._start(self._ask(name, worker))
-                request.add_done_callback(partial(self._forget_question, worker))
+                self._start(self._ask(name, worker))
 
     def _possibly_late(self, name: str, worker: Any) -> dict[Any, float]:
         """Return tasks that may be late if nothing has changed since the last heartbeat.
@@ -246,19 +244,19 @@ class TaskWatch:
         with self._failing(worker, key):
             await self._end_function(name, worker, key, annotations, error)
 
-    def _forget_question(self, worker: Any, _: object) -> None:
-        self._asked.discard(worker)
-
     async def _ask(self, name: str, worker: Any) -> None:
         """Ask a worker whether tasks are late that may be according to its last heartbeat."""
-        load = await request_load(self.scheduler, worker)
-        if load is None:
-            await self._free_blocked(name, worker)
-            return
-        for key, seconds in load.running.items():
-            task = self.scheduler.tasks.get(key)
-            if task is not None and self._is_late(name, worker, task, seconds):
-                self._end_soon(name, worker, task, seconds)
+        try:
+            load = await request_load(self.scheduler, worker)
+            if load is None:
+                await self._free_blocked(name, worker)
+                return
+            for key, seconds in load.running.items():
+                task = self.scheduler.tasks.get(key)
+                if task is not None and self._is_late(name, worker, task, seconds):
+                    self._end_soon(name, worker, task, seconds)
+        finally:
+            self._asked.discard(worker)
 
     async def _free_blocked(self, name: str, worker: Any) -> None:
         """Restart a worker that does not respond, and let a task fail if it is the only cause."""
