@@ -201,8 +201,11 @@ class RecordedSweeps:
 
     @property
     def is_compensated(self) -> bool:
-        """Whether the points are certainly motion-compensated, as in results of lidarpool."""
-        return self.recording.fired is not None
+        """Whether the points are certainly motion-compensated, as in results in world coordinates.
+
+        Results of stationary sensors count as compensated.
+        """
+        return self.recording.fired is not None and self.recording.compensated is not False
 
     def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
         """Return a copy that keeps some sweeps in memory.
@@ -399,8 +402,10 @@ def _lasers(recording: Recording, rings: Rings) -> RingLasers:
     sweeps = [recording.read_fired(number) for number in numbers]
     used = [(sweep.points, rings.ring_indices(sweep)) for sweep in sweeps if len(sweep)]
     lasers = RingLasers.from_sweeps(used, rings.elevation_rad)
+    if recording.fired is None or recording.compensated is False:
+        return lasers
     # The sweeps to reconstruct are motion-compensated, unlike the ones that were used.
-    return lasers if recording.fired is None else replace(lasers, spread_rad=float("inf"))
+    return replace(lasers, spread_rad=float("inf"))
 
 
 def _has_points(recording: Recording) -> bool:
