@@ -113,6 +113,30 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(client):
         np.testing.assert_allclose(cosine, expected, atol=2e-3)
 
 
+@pytest.mark.parametrize("keep", ["kitti", "webdataset"])
+def test_points_in_sensor_coordinates_are_those_of_the_format(cluster_client, keep):
+    """KITTI stores compensated points, whatever the coordinates of the job."""
+
+    def in_sensor(number: int, rng: np.random.Generator) -> Job:
+        job = make(number, rng)
+        return replace(
+            job, survey=replace(job.survey, noise=Noise(), precision_m=1e-4, coordinates="sensor")
+        )
+
+    def in_world(number: int, rng: np.random.Generator) -> Job:
+        job = make(number, rng)
+        return replace(job, survey=replace(job.survey, noise=Noise(), precision_m=1e-4))
+
+    streams = [
+        Campaign(job, 1, keep=keep).stream(client=cluster_client) for job in (in_sensor, in_world)
+    ]
+    for sweep, compensated in zip(*streams, strict=True):
+        assert compensated.compensated is True
+        assert sweep.compensated is (keep == "kitti")
+        difference_m = np.abs(sweep.points - compensated.points).max(initial=0)
+        assert (difference_m < 0.002) == (keep == "kitti")
+
+
 @pytest.mark.parametrize(("compensated", "outside_m"), [(False, 0.3), (True, 0.003)])
 def test_points_of_actors_are_moved_into_their_boxes(cluster_client, compensated, outside_m):
     """A car passes at 5 m/s, so that it moves by 0.5 m in a sweep."""

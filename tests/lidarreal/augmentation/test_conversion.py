@@ -110,7 +110,7 @@ def test_bare_points_to_bags(tmp_path, layout):
     assert "has no timestamps, so its sweeps are assumed to be 0.1 s apart." in text
     assert "has no column object, which MCAP requires. It is -1 for all points." in text
     recording = open_recording(tmp_path / "new.mcap", "/points", keep_noise=True)
-    assert recording.compensated is True
+    assert recording.compensated is None  # as in the recording
     assert recording.energy_unit is None  # the scale of the recording is unknown
     np.testing.assert_allclose(np.diff(recording.stamps_ns), 1e8)
     for number in range(2):

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -115,8 +115,9 @@ class DataSet:
         Layout of points in mcap files (see `lidarpool.save_cloud`).
     compensated
         Whether points in mcap files are in the sensor frame at the start of the sweep, without
-        times. Otherwise, each point is in the sensor frame at its firing. `lidarpool.sweeps`
-        returns points in the frame at the start of the sweep in both cases.
+        times. Otherwise, each point is in the sensor frame at its firing. If points are simulated
+        in world coordinates, `lidarpool.sweeps` returns points in the frame at the start of the
+        sweep in both cases.
     compensated_actors, pose_rate_hz
         See `lidarpool.save_cloud`.
     made_with
@@ -156,6 +157,14 @@ class DataSet:
     def check_installed(self) -> None:
         """Raise LidarError if a package that the format requires is not installed."""
         self.spec.check_installed()
+
+    def read_coordinates(self, job: str) -> str:
+        """Return the frame of the points that a job simulates, "world" or "sensor".
+
+        Raises LidarError if the file is missing or damaged.
+        """
+        name = job_file(self.format, job, SWEEPS_FILE)
+        return Sweeps.load_coordinates(self.storage.path(name), partial(self.storage.read, name))
 
     def write_job(
         self,

@@ -36,7 +36,7 @@ from ..clouds.job_reader import JobReader
 from ..identity.sealed import unseal_json
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
-from .sweep_data import sweep_of_job
+from .sweep_data import is_compensated, sweep_of_job
 
 _REQUESTS = 8  # number of sweeps read concurrently from a URL or disk
 _OPEN_JOBS = 16  # number of jobs that each thread keeps open, with their poses, boxes and files
@@ -139,6 +139,20 @@ class SavedSweeps:
         number = run.first + position - (int(self._run_stops[run_index]) - run.count)
         return self._opened(run.job), number
 
+    def are_compensated(self) -> bool | None:
+        """Return whether the sweeps are motion-compensated, or None if it differs between jobs.
+
+        Raises LidarError if a file is missing or damaged.
+        """
+        dataset = self._dataset
+        if is_compensated(dataset.spec, "sensor"):
+            return True
+        stated = {
+            is_compensated(dataset.spec, dataset.read_coordinates(job))
+            for job in dict.fromkeys(run.job.name for run in self._runs)
+        }
+        return stated.pop() if len(stated) == 1 else None
+
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return the sweeps as a `torch.utils.data.IterableDataset`.
 
@@ -195,7 +209,8 @@ class _OpenJob:
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage
         self.job = job
-        self.cloud_format = dataset.spec.cloud_format
+        self.spec = dataset.spec
+        self.cloud_format = self.spec.cloud_format
         name = job_file(dataset.format, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(storage.path(name), partial(storage.read, name))
         self.boxes: Boxes | None = None
@@ -228,7 +243,10 @@ class _OpenJob:
             file = self.reader.last_file or self.cloud_format.sweep_files(self.reader, sweep)[0]
             file = self.storage.path(file)
             raise _unreadable(file, error) from error
-        return sweep_of_job(self.job, self.sweeps, sweep, points, self.boxes, sweep)
+        compensated = is_compensated(self.spec, self.sweeps.coordinates)
+        return sweep_of_job(
+            self.job, self.sweeps, sweep, points, self.boxes, sweep, compensated=compensated
+        )
 
 
 def sweeps(

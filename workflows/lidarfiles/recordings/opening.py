@@ -209,4 +209,6 @@ def _point_files(folder: Path) -> list[Path]:
 def _open_data_set(source: RecordingSource) -> Recording:
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
     source.selected.add(source.sensor or "")
-    return source.recording(len(saved), saved.__getitem__, compensated=True, noise_classes=None)
+    return source.recording(
+        len(saved), saved.__getitem__, compensated=saved.are_compensated(), noise_classes=None
+    )

@@ -21,9 +21,10 @@ import numpy as np
 from distributed import Client
 
 from lidarfiles.clouds.boxes import Boxes
+from lidarfiles.clouds.cloud_format import PointColumns
 from lidarfiles.clouds.kitti import kitti_intensity
 from lidarfiles.datasets.job_table import JobRow
-from lidarfiles.datasets.sweep_data import sweep_of_job
+from lidarfiles.datasets.sweep_data import is_compensated, sweep_of_job
 from lidarscenario.campaign.campaign import CampaignSpec
 from lidarscenario.campaign.campaign_sections import DatasetFormat
 from lidarscenario.empty_cloud import empty_cloud_reason
@@ -37,6 +38,7 @@ from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, message_of
 from lidarsim.simulator.memory import MB, scans_that_fit
+from lidarsim.sweeps.sweeps import Sweeps
 from poolpart import Partition, PoolError
 from poolpart.fetch import fetch_available
 
@@ -157,17 +159,29 @@ class _StreamedSweeps:
         self.points_read += len(cloud)
         if self.keep.compensated_actors:
             cloud = sweeps.with_actors_at_start(number, cloud)
-        positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
-        in_sensor = sweeps.columns_in_sensor(number, cloud)
-        columns = {column.name: np.array(in_sensor[column.name]) for column in table}
+        compensated = is_compensated(self.keep.export_spec, sweeps.coordinates)
+        points = _points_in_sensor(sweeps, number, cloud, compensated=compensated)
         if self.keep.format == "kitti":  # files in this format have a different intensity
-            columns["intensity"] = kitti_intensity(cloud)
+            points[1]["intensity"] = kitti_intensity(cloud)
         if survey.actor_visibility:
             sweeps = sweeps.with_actor_rays(part.actor_rays for part in parts)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.to_sensor_frame(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
-        return sweep_of_job(row, sweeps, number, (positions, columns), boxes)
+        return sweep_of_job(row, sweeps, number, points, boxes, compensated=compensated)
+
+
+def _points_in_sensor(
+    sweeps: Sweeps, number: int, cloud: Cloud, *, compensated: bool
+) -> PointColumns:
+    """Return the points of a sweep in the sensor frame, with all of their columns."""
+    if compensated:
+        positions = sweeps.compensate_motion(number, cloud)
+        columns = sweeps.columns_compensated(number, cloud)
+    else:
+        positions = sweeps.in_sensor(number, cloud.positions)
+        columns = sweeps.columns_in_sensor(number, cloud)
+    return positions.astype(np.float32), {name: np.array(columns[name]) for name in columns}
 
 
 class _Casting:

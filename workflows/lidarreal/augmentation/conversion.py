@@ -24,7 +24,14 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.lidar_traits import LidarTraits
-from lidarsim.sweeps.sweeps import SweepPoses, Sweeps, actor_type
+from lidarsim.sweeps.sweeps import (
+    AS_FIRED,
+    COMPENSATED,
+    UNKNOWN_MOTION,
+    SweepPoses,
+    Sweeps,
+    actor_type,
+)
 from lidarsim.words import join_names
 
 from .augmented_sweep import AugmentedSweep
@@ -47,6 +54,7 @@ _NEUTRAL = {
 # Columns that are always written if the recording contains them, or if they can be derived.
 _KEPT = ("time", "intensity", "reflectivity", "return_number", "returns", "class", "cause", *COLORS)
 _STRENGTHS = ("intensity", "reflectivity", "signal")  # formats store one of them
+_FRAMES = {True: COMPENSATED, False: AS_FIRED, None: UNKNOWN_MOTION}  # of the sensor
 _DERIVED = ("range", "azimuth", "elevation")  # columns that follow from the positions
 
 
@@ -332,6 +340,7 @@ class FormatConverter(Rewriter):
             epsg=None if self._in_sensor else self.recording.epsg,
             start_ns=epoch_ns if epoch_ns is not None and epoch_ns > _MIN_EPOCH_NS else None,
             lidars=(LidarTraits(summary.channels, mode=""),),
+            stated_frame=_FRAMES[self.recording.compensated],
         )
 
     def _notes(self, summary: _Summary, needed: set[str]) -> list[str]:

@@ -51,6 +51,7 @@ MIXED_UP = (
 # Descriptions of the coordinate frame of points, which are written to files.
 COMPENSATED = "points in the sensor frame at the start of the sweep (motion is compensated)"
 AS_FIRED = "points in the sensor frame at the time of firing (motion is not compensated)"
+UNKNOWN_MOTION = "points in the sensor frame (motion compensation is unknown)"
 IN_WORLD = "points in world coordinates"
 _ACTORS_AT_START = "; points of actors are moved to the start of the sweep"
 _NO_KNOTS = np.empty((0, 7), np.float32)
@@ -194,6 +195,9 @@ class Sweeps:
     actor_rays: Records = field(default_factory=lambda: NO_ACTOR_RAYS[None])
     # Whether `points` moves points on actors to their positions at the start of the sweep.
     actors_at_start: bool = False
+    # Description of the points' coordinate frame for files. If it is empty, it follows from the
+    # points that a format stores.
+    stated_frame: str = ""
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -483,8 +487,11 @@ class Sweeps:
         return np.asarray(since_begin, np.float64)
 
     def frame_text(self, *, compensated: bool) -> str:
-        """Return the description of the points' coordinate frame for files."""
-        text = COMPENSATED if compensated else AS_FIRED
+        """Return the description of the points' coordinate frame for files.
+
+        `compensated` states whether the format stores motion-compensated points.
+        """
+        text = self.stated_frame or (COMPENSATED if compensated else AS_FIRED)
         return text + _ACTORS_AT_START if self.actors_at_start else text
 
     @cached_property
@@ -736,6 +743,15 @@ class Sweeps:
         return pack_arrays(arrays)
 
     @classmethod
+    def load_coordinates(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> str:
+        """Load only the frame of the points in the cloud, "world" or "sensor".
+
+        Parameters and errors are those of `load`.
+        """
+        with open_archive(path, read) as arrays:
+            return str(_stored_words(arrays)["coordinates"])
+
+    @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
         """Read sweeps from a file written by `save`, without unpickling objects.
 
@@ -747,9 +763,7 @@ class Sweeps:
             If the file cannot be read, is damaged, or was written by a different version.
         """
         with open_archive(path, read) as arrays:
-            values = json.loads(arrays["words"].tobytes())
-            if values["format"] != _FORMAT:
-                raise ValueError(f"its format is {values['format']}, but {_FORMAT} is required")
+            values = _stored_words(arrays)
             values |= {name: tuple(values[name]) for name in ("sensors", "objects", "actors")}
             pose, mounts, actor_poses = (
                 SweepPoses(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
@@ -778,6 +792,17 @@ class Sweeps:
                 **{name: values[name] for name in _JSON_FIELDS},
                 **{name: values[name] for name in ("actor_rays",) if name in values},
             )
+
+
+def _stored_words(arrays: Mapping[str, AnyArray]) -> dict[str, Any]:
+    """Return the values that an archive of sweeps stores as JSON.
+
+    Raise ValueError if it has a different format.
+    """
+    values: dict[str, Any] = json.loads(arrays["words"].tobytes())
+    if values["format"] != _FORMAT:
+        raise ValueError(f"its format is {values['format']}, but {_FORMAT} is required")
+    return values
 
 
 def actor_type(name: str) -> str:
