@@ -5,13 +5,15 @@ from functools import partial
 
 import numpy as np
 import pytest
+from tests.simulated_drives import simulated_drive
 
+from lidarfiles import open_recording
 from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.insertions import load_insertion
 from lidarreal.augmentation.object_classes import find_class
-from lidarsim import Fault, Pose, Scanner, Scene, Track, load_sensor
+from lidarsim import Fault, Pose, Scanner, Scene, Survey, Track, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError
@@ -601,3 +603,24 @@ def test_sweeps_of_different_sensors_are_refused(scene, sensor):
     ]
     with pytest.raises(LidarError, match="the sweeps come from different sensors"):
         Augmenter(recording_of(clouds), Effects(weather=Weather(snow_mm_h=1.0)))
+
+
+@pytest.mark.parametrize("model", ["livox/mid360", "livox/avia"])
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_lines_of_a_moving_livox_need_not_be_cones(model, coordinates):
+    """The surfaces that a line hits differ from sweep to sweep."""
+    sizes = {"Floor": (60, 40, 0.1), "Wall": (1, 20, 6), "Side": (30, 1, 5)}
+    hall = Scene.from_meshes([box(name, size) for name, size in sizes.items()])
+    survey = Survey(
+        load_sensor(model),
+        trajectory=Track([0, 1], [[-9, -6, HEIGHT_M], [7, -6, HEIGHT_M]]),
+        steps=36 * SWEEPS,
+        columns=["time", "intensity"],
+        coordinates=coordinates,
+    )
+    recording = open_recording(simulated_drive(hall, survey), name="drive")
+    augmenter = Augmenter(recording, Effects(weather=Weather(visibility_km=0.02)))
+    assert any("pulses without a return are unknown" in note for note in augmenter.notes)
+    results = [augmenter.sweep(number) for number in range(SWEEPS)]
+    assert all(result.is_recorded.any() for result in results)
+    assert any((~result.is_recorded).any() for result in results)

@@ -96,7 +96,7 @@ class Rings:
         numbers, medians, spread_rad = summarize_rings(rings.astype(np.int64), elevation)
         if len(numbers) < MIN_RINGS:
             return cls(name)
-        if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
+        if not form_cones(medians, spread_rad):
             note = (
                 f"The rings of {name} do not form cones, so its ray directions are not calibrated."
             )
@@ -213,6 +213,15 @@ def summarize_rings(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float
     low, medians, high = np.array([np.quantile(part, (0.25, 0.5, 0.75)) for part in parts]).T
     order = np.argsort(-medians, kind="stable")
     return numbers[order], medians[order], float(np.median(high - low))
+
+
+def form_cones(elevation_rad: Floats, spread_rad: float) -> bool:
+    """Return whether rings lie on cones, unlike the lines of a Livox.
+
+    `elevation_rad` are the median elevations of the rings, and `spread_rad` is their deviation from
+    cones, as `summarize_rings` returns them.
+    """
+    return bool(spread_rad <= _MAX_CONE_SPREAD * np.ptp(elevation_rad))
 
 
 def _clusters(points: Floats) -> Floats | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.recording import Recording
-from lidarfiles.clouds.rings import Rings, elevations, summarize_rings
+from lidarfiles.clouds.rings import Rings, elevations, form_cones, summarize_rings
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
@@ -464,13 +464,19 @@ def _check_model(recording: Recording, model: Sensor | None) -> None:
 
 
 def _check_single_sensor(recording: Recording, sweeps: Sequence[Sweep]) -> None:
-    """Raise LidarError if rings with the same number have different elevations in some sweeps."""
+    """Raise LidarError if rings with the same number have different elevations in some sweeps.
+
+    Sweeps whose rings do not form cones are not compared, because the median elevation of a line
+    depends on the surfaces that it hits.
+    """
     medians: dict[int, list[float]] = {}
     for sweep in sweeps:
         if "channel" not in sweep.columns:
             return
         channel = np.asarray(sweep.columns["channel"]).astype(np.int64)
-        numbers, elevation, _ = summarize_rings(channel, elevations(sweep.points))
+        numbers, elevation, spread_rad = summarize_rings(channel, elevations(sweep.points))
+        if not form_cones(elevation, spread_rad):
+            continue
         for number, median in zip(numbers.tolist(), elevation.tolist(), strict=True):
             medians.setdefault(number, []).append(median)
     spreads = [max(values) - min(values) for values in medians.values() if len(values) > 1]
