@@ -135,6 +135,27 @@ def test_without_times_a_revolution_need_not_be_a_whole_number_of_firings(room):
     assert fitted.figures["firings_per_turn"] == pytest.approx(1808.449, abs=0.01)
 
 
+@pytest.mark.parametrize("columns", [("channel", "time"), ("channel",)])
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_rings_may_return_in_half_a_revolution(tmp_path, columns, lost):
+    """A sensor beside a wall: the sector without returns is wider than 180 degrees."""
+    boxes = [
+        box("wall", (6, -40, 0), (7, 40, 12)),
+        box("low", (4, 1, 0), (5, 3, 5)),
+        box("high", (3, -4, 3), (4, -2, 8)),
+        box("floor", (0.5, -40, -0.1), (7, 40, 0)),
+    ]
+    sensor = load_sensor("velodyne/vlp16")
+    recording = record(Scene.from_meshes(boxes), sensor, columns=columns, lost=lost)
+    azimuth = np.sort(np.arctan2(*recording[0].points[:, 1::-1].T))
+    assert np.diff(azimuth, append=azimuth[0] + 2 * np.pi).max() > np.pi
+    fitted = fit_pattern(recording)
+    assert fitted.figures["firings_per_turn"] == pytest.approx(1808.449, abs=0.01)
+    found = reloaded(fitted, tmp_path)
+    assert found.head.clockwise
+    assert errors_of(sensor, found)[0] < MAX_ERROR_DEG
+
+
 def test_rings_and_times_can_both_be_missing(room, tmp_path):
     sensor = Sensor.grid(720, 16, 30, max_range_m=100)
     fitted = fit_pattern(record(room, sensor, columns=[], are_stamped=False))

@@ -23,6 +23,7 @@ from .phases import MIN_STEP_RAD, RingPhases, RingSeries, ring_steps
 
 _TURN = 2 * np.pi
 _SAME_PULSE_S = 1e-8
+_MAX_JOINED_STEPS = 20  # a longer time between returns of a ring may be a sector without returns
 _MIN_RETURNS = 50  # minimum number of returns of a ring in a sweep to measure the rotation
 _MAX_SPREADS = 10.0  # maximum spread of the elevations of a ring relative to other rings
 _MAX_CONE_RAD = np.radians(0.05)  # spread of the elevations of a ring that is always plausible
@@ -262,17 +263,23 @@ def _measure_timed_firings(returns: PatternReturns, azimuth: Floats) -> dict[str
 
 
 def _rough_rotation(returns: PatternReturns, azimuth: Floats) -> float:
-    """Return the approximate angular velocity in radians per second."""
+    """Return the approximate angular velocity in radians per second.
+
+    Sectors without returns are excluded, because it is unknown in which direction azimuths change
+    across a sector of more than 180°.
+    """
     assert returns.time_s is not None
     order = np.lexsort((returns.time_s, returns.ring, returns.sweep))
     group = returns.sweep[order] * len(returns.elevation_rad) + returns.ring[order]
     starts = np.flatnonzero(np.diff(group, prepend=-1))
     rates = []
     for rows in np.split(order, starts[1:]):
-        span_s = float(returns.time_s[rows[-1]] - returns.time_s[rows[0]])
-        if len(rows) >= _MIN_RETURNS and span_s > 0:
-            turned = np.unwrap(azimuth[rows])
-            rates.append(float(turned[-1] - turned[0]) / span_s)
+        steps_s = np.diff(returns.time_s[rows])
+        if len(rows) < _MIN_RETURNS or steps_s.max() <= _SAME_PULSE_S:
+            continue
+        turned = (np.diff(azimuth[rows]) + np.pi) % _TURN - np.pi
+        joined = steps_s < _MAX_JOINED_STEPS * np.median(steps_s[steps_s > _SAME_PULSE_S])
+        rates.append(float(turned[joined].sum() / steps_s[joined].sum()))
     if not rates:
         raise LidarError(
             f"The rings of {returns.name} have too few returns, or all returns of a sweep have the "
@@ -401,12 +408,24 @@ def _since_start(returns: PatternReturns, azimuth: Floats, *, is_clockwise: bool
     """Return azimuths that do not jump within a sweep.
 
     If a revolution is not a whole number of firings, the azimuths of consecutive revolutions
-    differ. A sweep therefore starts at the azimuth of its first points.
+    differ. A sweep therefore starts at the azimuth of its first points, and its azimuths continue
+    to increase where it passes this azimuth again. Points are in order within their rings.
     """
     sign = -1.0 if is_clockwise else 1.0
     _, first = np.unique(returns.sweep, return_index=True)
     start_rad = sign * azimuth[first][returns.sweep - returns.sweep[0]] - _START_MARGIN_RAD
-    return np.asarray(sign * (start_rad + (sign * azimuth - start_rad) % _TURN))
+    since_rad = (sign * azimuth - start_rad) % _TURN
+    order = np.lexsort((returns.ring, returns.sweep))  # stable, so the order in a ring remains
+    before, after = since_rad[order[:-1]], since_rad[order[1:]]
+    is_passed = (after < before - np.pi).astype(np.int64)
+    is_passed -= (before < _START_MARGIN_RAD) & (after > _TURN - _START_MARGIN_RAD)
+    group = returns.sweep[order] * (returns.ring.max() + 1) + returns.ring[order]
+    is_first = np.diff(group, prepend=-1) != 0
+    passed = np.append(0, np.cumsum(np.where(is_first[1:], 0, is_passed)))
+    passed -= passed[is_first].repeat(np.diff(np.flatnonzero(np.append(is_first, True))))
+    turns = np.empty(len(order))
+    turns[order] = passed
+    return np.asarray(sign * (start_rad + since_rad + _TURN * turns))
 
 
 def _offsets_in_order(
