@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -11,6 +13,7 @@ from tests.simulated_drives import simulated_drive
 import lidarfiles
 from lidarfiles import open_recording, save_cloud
 from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
@@ -19,7 +22,8 @@ from lidarreal.reconstruction.alignment import first_alignment
 from lidarreal.reconstruction.motion import Motion
 from lidarreal.reconstruction.odometry import find_poses
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarsim import Scene, Sensor, Survey, Track, box
+from lidarsim import Scene, Sensor, Survey, Track, box, load_sensor
+from lidarsim.columns.sweep import Sweep
 from lidarsim.io.storage import Storage
 
 SWEEPS = 8
@@ -33,17 +37,28 @@ def hall():
     return Scene.from_meshes([box(name, size) for name, size in sizes.items()])
 
 
-def drive(coordinates, speed_m_s=SPEED_M_S):
-    """Return the recorded sweeps of a drive along the hall: a cloud in memory."""
+def corridor():
+    """A floor and two walls that are the same everywhere, so that no motion is visible."""
+    boxes = {"Floor": (200, 20, 0.1), "Left": (200, 1, 5), "Right": (200, 1, 5)}
+    middles = {"Floor": (0, 0, 0), "Left": (0, 8, 0), "Right": (0, -9, 0)}
+    meshes = []
+    for name, size in boxes.items():
+        mesh = box(name, size)
+        meshes.append(replace(mesh, vertices=mesh.vertices + np.array(middles[name])))
+    return Scene.from_meshes(meshes)
+
+
+def drive(coordinates="world", scene=None, sensor=None):
+    """Return the recorded sweeps of a drive, by default along the hall: a cloud in memory."""
     survey = Survey(
-        Sensor.grid(360, 16, vertical_fov_deg=30),
-        trajectory=Track([0, 1], [[-9, -6, 2], [speed_m_s - 9, -6, 2]]),
+        sensor or Sensor.grid(360, 16, vertical_fov_deg=30),
+        trajectory=Track([0, 1], [[-9, -6, 2], [SPEED_M_S - 9, -6, 2]]),
         steps=36 * SWEEPS,
         columns=["time", "ray", "range", "intensity", "reflectivity", "class"],
         coordinates=coordinates,
         precision_m=1e-4,
     )
-    return simulated_drive(hall(), survey)
+    return simulated_drive(scene or hall(), survey)
 
 
 def aligned(recording):
@@ -53,7 +68,7 @@ def aligned(recording):
 
 
 def test_a_twin_compensates_results_in_sensor_coordinates():
-    compensated = open_recording(drive("world"), name="world")
+    compensated = open_recording(drive(), name="world")
     sweeps, alignment = aligned(open_recording(drive("sensor"), name="sensor"))
     assert alignment.motion is Motion.TIMED
     for number in (1, 5):
@@ -94,7 +109,7 @@ def test_sweeps_of_data_sets_state_their_compensation(name, coordinates, tmp_pat
 
 
 def test_data_sets_of_different_jobs_state_no_common_compensation(tmp_path):
-    folder = write_data_set(tmp_path, "webdataset", drive("world"), drive("sensor"))
+    folder = write_data_set(tmp_path, "webdataset", drive(), drive("sensor"))
     recording = open_recording(folder)
     assert recording.compensated is None
     assert [recording[number].compensated for number in (0, SWEEPS)] == [True, False]
@@ -106,7 +121,7 @@ def test_data_sets_of_different_jobs_state_no_common_compensation(tmp_path):
 def test_conversions_state_what_their_source_states(compensated, is_stated, name, tmp_path):
     ExportSpec(name).check_installed()
     folder = tmp_path / "drive"
-    save_cloud(drive("world"), folder, format="pcd", compensated=compensated)
+    save_cloud(drive(), folder, format="pcd", compensated=compensated)
     for path in () if is_stated else folder.iterdir():
         comment, _, rest = path.read_bytes().partition(b"\n")
         assert b"motion is" in comment
@@ -120,3 +135,63 @@ def test_conversions_state_what_their_source_states(compensated, is_stated, name
     converted = open_recording(target)
     assert converted.compensated is stated
     assert (converted[3].times_s is None) == compensated
+
+
+# {format: options, and whether the points are compensated}
+STATED = {
+    "mcap": ("mcap", "new.mcap", {}, False),
+    "compensated mcap": ("mcap", "new.mcap", {"compensated": True}, True),
+    "pcd": ("pcd", "new", {}, False),
+    "compensated pcd": ("pcd", "new", {"compensated": True}, True),
+    "webdataset": ("webdataset", "new", {}, True),
+    "images": ("images", "new", {}, True),
+    "nuscenes": ("nuscenes", "new", {}, True),
+    "e57": ("e57", "new.e57", {}, True),
+}
+
+
+@pytest.mark.parametrize("key", STATED)
+def test_a_twin_uses_the_compensation_that_files_state(key, tmp_path):
+    """In a corridor, the points do not show whether they are compensated."""
+    name, file, options, compensated = STATED[key]
+    ExportSpec(name).check_installed()
+    save_cloud(drive(scene=corridor()), tmp_path / file, format=name, **options)
+    recording = open_recording(tmp_path / file)
+    assert recording.compensated is compensated
+    assert recording[3].compensated is compensated
+    _, alignment = aligned(recording)
+    assert alignment.motion is (Motion.COMPENSATED if compensated else Motion.TIMED)
+
+
+@pytest.mark.parametrize("name", ["webdataset", "images"])
+def test_training_formats_state_points_as_fired(name, tmp_path):
+    save_cloud(drive("sensor", corridor()), tmp_path / "new", format=name)
+    recording = open_recording(tmp_path / "new")
+    assert recording.compensated is False
+    assert recording[3].compensated is False
+    _, alignment = aligned(recording)
+    assert alignment.motion is Motion.TIMED
+
+
+def test_packets_are_as_fired(tmp_path):
+    save_cloud(drive(sensor=load_sensor("velodyne/vlp16")), tmp_path / "pcap", format="pcap")
+    recording = open_recording(tmp_path / "pcap" / "lidar.pcap")
+    assert recording.compensated is False
+    assert recording[3].compensated is False
+
+
+def test_points_as_fired_without_times_are_compensated_by_their_azimuth():
+    fired = open_recording(drive("sensor", corridor()), name="drive")
+
+    def recording(compensated):
+        def read(number):
+            sweep = fired[number]
+            order = np.argsort(sweep.columns["time"], kind="stable")
+            columns = {"channel": sweep.columns["channel"]}
+            return Sweep(sweep.points, columns, pose=sweep.pose).select(order)
+
+        return Recording("drive", SWEEPS, read, compensated=compensated)
+
+    assert aligned(recording(None))[1].motion is Motion.COMPENSATED
+    assert aligned(recording(True))[1].motion is Motion.COMPENSATED
+    assert aligned(recording(False))[1].motion.is_turning

@@ -5,7 +5,7 @@ Rays without a return are included.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -22,7 +22,7 @@ from lidarsim.io.input_files import read_input
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.numerics.arrays import AnyArray
 from lidarsim.sweeps.ray_image import RayImage, require_fired_rays
-from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
 
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
@@ -160,9 +160,17 @@ def _sensors(source: RecordingSource) -> dict[str, Recording]:
         def read(number: int) -> Sweep:
             with open_archive(files[number], partial(read_input, files[number])) as images:
                 pose = images["pose"]
+                compensated = _stated_compensation(images)
                 points, columns = points_of_images(images)
-            return Sweep(points, columns, pose=pose)
+            return Sweep(points, columns, pose=pose, compensated=compensated)
 
-        return source.recording(len(files), read)
+        with open_archive(files[0], partial(read_input, files[0])) as images:
+            compensated = _stated_compensation(images)
+        return source.recording(len(files), read, compensated=compensated)
 
     return {sensor: recording(files) for sensor, files in files_of_sensor.items() if files}
+
+
+def _stated_compensation(images: Mapping[str, AnyArray]) -> bool | None:
+    """Return whether a sweep is motion-compensated, or None if its file does not state this."""
+    return states_compensation(str(images["frame"])) if "frame" in images else None

@@ -28,7 +28,7 @@ from lidarsim.motion.rotations import recorded_rotation
 from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
-from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
 
 from ..identity.fingerprint import fingerprint
 from .boxes import Boxes, json_number
@@ -600,6 +600,7 @@ def _recording(source: RecordingSource, tables: NuScenesTables, rows: list[_Row]
         lambda number: tables.read(rows[number]),
         read_stamps=times_ns.tolist,
         read_boxes=lambda: tables.boxes(rows),
+        compensated=states_compensation(str(tables.scene(rows[0]).get("description"))),
         sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
     )
 
@@ -658,10 +659,13 @@ class NuScenesTables:
         """Number of scenes."""
         return len(self._scenes)
 
+    def scene(self, row: _Row) -> _Row:
+        """Return the row of the scene of a sweep."""
+        return self._scenes[self._samples[row["sample_token"]]["scene_token"]]
+
     def scene_name(self, row: _Row) -> str:
         """Return the name of the scene of a sweep."""
-        scene = self._scenes[self._samples[row["sample_token"]]["scene_token"]]
-        return str(scene["name"])
+        return str(self.scene(row)["name"])
 
     def lidar_rows(self) -> dict[str, list[_Row]]:
         """Return the sweeps of each lidar channel, sorted by time.

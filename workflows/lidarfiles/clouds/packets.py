@@ -108,6 +108,7 @@ def _open_capture(source: RecordingSource) -> Recording:
         sweeps,
         convert,
         white=white,
+        compensated=False,
         sensor=name,
         read_stamps=lambda: map(decoder.time_ns, sweeps()),
         notes=source.prefix_notes(decoder.notes),

@@ -135,8 +135,8 @@ class Recording:
         Function that returns approximately the given number of points, which are evenly distributed
         in the file.
     compensated
-        Whether the points are compensated for the motion of the sensor, according to the file. None
-        if this is unknown, or if the sensor does not move.
+        Whether the points are compensated for the motion of the sensor, according to the file or
+        its format. None if this is unknown, or if the sensor does not move.
     meters
         Units of x, y and z in meters.
     system

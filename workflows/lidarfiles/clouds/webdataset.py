@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from lidarsim.io.input_files import input_size
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyArray, Ints
-from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
 
 from .boxes import Boxes, SweepBoxes, json_number
 from .cloud_format import Entry, PointColumns
@@ -218,19 +219,39 @@ def _shard(entry: Entry | None, start: int) -> str:
 # -- reading ---------------------------------------------------------------------------------
 
 
+class _Sample(NamedTuple):
+    """Sample in a tar file."""
+
+    path: Path
+    members: dict[str, tuple[int, int]]  # {extension: (offset, size)}
+    time_ns: float | None
+    compensated: bool | None  # whether the points are motion-compensated
+
+    def read(self) -> Sweep:
+        arrays = {
+            name.removesuffix(".npy"): read_npy(_slice(self.path, *span), name)
+            for name, span in self.members.items()
+            if name.endswith(".npy") and name != "boxes.npy"
+        }
+        pose = arrays.pop("pose", None)
+        points = arrays.pop("points")
+        return Sweep(points, arrays, pose=pose, time_ns=self.time_ns, compensated=self.compensated)
+
+
 def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:
     """Open the samples in tar files, keyed by sensor.
 
     A sample consists of ``KEY.points.npy``, and optionally ``KEY.json`` and further arrays. Raises
     LidarError if no sample has points.
     """
-    samples_of_sensor: dict[str, list[tuple[float | None, Path, dict[str, tuple[int, int]]]]] = {}
+    samples_of_sensor: dict[str, list[_Sample]] = {}
     for path in files:
         for members in _samples(path).values():
             if "points.npy" not in members:
                 continue
             description = json.loads(_slice(path, *members["json"])) if "json" in members else {}
-            sample = (description.get("time_ns"), path, members)
+            compensated = states_compensation(str(description.get("frame")))
+            sample = _Sample(path, members, description.get("time_ns"), compensated)
             samples_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
     if not samples_of_sensor:
         raise LidarError(
@@ -238,23 +259,15 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
             "files named KEY.points.npy."
         )
 
-    def recording(
-        samples: list[tuple[float | None, Path, dict[str, tuple[int, int]]]],
-    ) -> Recording:
-        def read(number: int) -> Sweep:
-            time_ns, path, members = samples[number]
-            arrays = {
-                name.removesuffix(".npy"): read_npy(_slice(path, *span), name)
-                for name, span in members.items()
-                if name.endswith(".npy") and name != "boxes.npy"
-            }
-            pose = arrays.pop("pose", None)
-            return Sweep(arrays.pop("points"), arrays, pose=pose, time_ns=time_ns)
-
-        times = [time for time, _, _ in samples]
+    def recording(samples: list[_Sample]) -> Recording:
+        times = [sample.time_ns for sample in samples]
         times_ns = None if None in times else np.array(times, np.float64)
+        stated = {sample.compensated for sample in samples}
         return source.recording(
-            len(samples), read, read_stamps=None if times_ns is None else times_ns.tolist
+            len(samples),
+            lambda number: samples[number].read(),
+            read_stamps=None if times_ns is None else times_ns.tolist,
+            compensated=stated.pop() if len(stated) == 1 else None,
         )
 
     return {sensor: recording(samples) for sensor, samples in samples_of_sensor.items()}

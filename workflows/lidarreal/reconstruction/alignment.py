@@ -454,7 +454,7 @@ def align(
 
 
 def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Motion:
-    """Determine whether the points are motion-compensated.
+    """Determine whether the points are motion-compensated, unless the recording states it.
 
     If they are not, also determine how their firing times are known. Surfaces that several sweeps
     observe share voxels if the points are compensated correctly. The candidate is chosen for which
@@ -466,21 +466,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     window = _fastest_window(poses)
     numbers = range(sweeps.count)[window]
     samples = [_sample(sweeps.read_surfaces(number), number) for number in numbers]
-    is_timed = all("time_s" in sample.columns for sample in samples)
-    if sweeps.is_compensated:
-        candidates = [Motion.COMPENSATED]
-    elif is_timed:
-        candidates = [Motion.TIMED, Motion.COMPENSATED]
-    elif len(sweeps.elevation_rad):
-        candidates = [
-            Motion.COMPENSATED,
-            Motion.COUNTERCLOCKWISE,
-            Motion.CLOCKWISE,
-            Motion.CENTERED_COUNTERCLOCKWISE,
-            Motion.CENTERED_CLOCKWISE,
-        ]
-    else:
-        candidates = [Motion.COMPENSATED]
+    candidates = _motion_candidates(sweeps, samples)
     name = sweeps.recording.name
     local = poses.select(window)
     trial = partial(_filled_voxels, sweeps, samples, local, voxel_m)
@@ -497,6 +483,24 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
             "coordinate systems of the same handedness."
         )
     return best
+
+
+def _motion_candidates(sweeps: RecordedSweeps, samples: Sequence[Sweep]) -> list[Motion]:
+    """Return the possible motions, starting with the one that is used if several fit."""
+    if sweeps.is_compensated:
+        return [Motion.COMPENSATED]
+    compensated = [] if sweeps.is_compensated is False else [Motion.COMPENSATED]
+    if all("time_s" in sample.columns for sample in samples):
+        return [Motion.TIMED, *compensated]
+    if len(sweeps.elevation_rad):
+        return [
+            *compensated,
+            Motion.COUNTERCLOCKWISE,
+            Motion.CLOCKWISE,
+            Motion.CENTERED_COUNTERCLOCKWISE,
+            Motion.CENTERED_CLOCKWISE,
+        ]
+    return [Motion.COMPENSATED]  # The firing times are unknown.
 
 
 def _filled_voxels(

@@ -1,10 +1,11 @@
 """Sensor motion during a sweep, for which points are compensated.
 
 Recordings store points either as fired, in the sensor frame at the time of each firing, or
-motion-compensated, in the sensor frame at the start of the sweep. Files do not state which. The
-compensation of a point as fired is a fraction of the motion to the next or from the previous sweep.
-The fraction follows from the time of the point relative to the timestamp of the sweep or, without
-point times, from its azimuth. The pose of a sweep is valid at its timestamp.
+motion-compensated, in the sensor frame at the start of the sweep. If a recording does not state
+which, the alignment determines it. The compensation of a point as fired is a fraction of the motion
+to the next or from the previous sweep. The fraction follows from the time of the point relative to
+the timestamp of the sweep or, without point times, from its azimuth. The pose of a sweep is valid
+at its timestamp.
 
 The timestamp is that of the first point, or that of the middle of the sweep, as in KITTI: a camera
 is triggered when the sensor faces forward, and the points are sorted from this azimuth on, although

@@ -200,12 +200,15 @@ class RecordedSweeps:
         return float(np.median(-np.diff(self.elevation_rad)))
 
     @property
-    def is_compensated(self) -> bool:
-        """Whether the points are certainly motion-compensated, as in results in world coordinates.
+    def is_compensated(self) -> bool | None:
+        """Whether the points are motion-compensated. None if the recording does not state it.
 
         Results of stationary sensors count as compensated.
         """
-        return self.recording.fired is not None and self.recording.compensated is not False
+        recording = self.recording
+        if recording.fired is not None and recording.compensated is None:
+            return True
+        return recording.compensated
 
     def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
         """Return a copy that keeps some sweeps in memory.
@@ -260,14 +263,15 @@ class RecordedSweeps:
         """Read the returns of a sweep whose rings can be determined, except those of the vehicle.
 
         The sweep has the following columns. All except `row` are omitted if they are unknown, and
-        `time_s` and `start_rad` are also omitted if the points are known to be motion-compensated.
+        `time_s` and `start_rad` are also omitted if the points are stated to be
+        motion-compensated.
 
         - `row`: index of the ring in `rings`, or 0 for a sensor without rings.
         - `intensity`: on the scale of the recording.
         - `label`: see `labels_of`.
         - `time_s`: time relative to the timestamp of the sweep, which may be that of its last
           point.
-        - `fired_s`: the same time, only if the points are known to be motion-compensated.
+        - `fired_s`: the same time, only if the points are stated to be motion-compensated.
         - `start_rad`: azimuth at which the ring of the point starts.
 
         Raises
