@@ -16,6 +16,8 @@ from lidarfiles import save_cloud
 from lidarfiles.clouds import las
 from lidarfiles.clouds.ros import bags
 from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.datasets.dataset import DataSet
+from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarfiles.recordings.opening import open_recording
 from lidarpool.cli.result_commands import view as view_command
 from lidarpool.pages import recorded
@@ -24,6 +26,7 @@ from lidarpool.pages.opened import growing_view, is_data_set, open_view, open_vi
 from lidarsim import LidarError, Mounted, Noise, Pose, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
+from lidarsim.io.storage import Storage
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
@@ -35,7 +38,7 @@ FORMATS = (
     "rosbag2",
 )  # fmt: skip
 BAGS = ("mcap", "rosbag2")
-UNCOMPENSATED = ("pcd", *BAGS)  # points are where the sensor was at the start of the sweep
+UNCOMPENSATED = ("pcd",)  # without times of sweeps, points are placed at the start of the sweep
 CLOUDS = ("las", "laz", "parquet")  # without sweeps
 COLUMNS = ["ray", "range", "intensity", "reflectivity", "class", "time", "normal_x", "normal_y"]
 
@@ -87,6 +90,8 @@ def test_each_format_is_opened_at_its_place_with_its_sweeps(exported, name):
     assert name in ("kitti", "nuscenes", "e57", *BAGS) or {"intensity", "normal_z"} <= names
     if name in CLOUDS:
         assert view.sweeps is None and not state["note"]
+    elif name in UNCOMPENSATED:
+        assert "contains points as fired, but not the times of its sweeps." in state["note"]
     else:
         assert len(view.sweeps) == 3 * sensors and len(sweeps) == 6
     if name == "kitti":  # whose poses start at the first of each sequence
@@ -504,6 +509,26 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     for name, extra in (("cloud.e57", "e57"), ("cloud.parquet", "parquet")):
         with pytest.raises(LidarError, match=rf"\.\[{extra}\]"):
             open_view(folder / name)
+
+
+@pytest.mark.parametrize("kind", ["folder", "webdataset", "mcap"])
+def test_a_job_with_points_as_fired_is_shown_in_world_coordinates(tmp_path, kind):
+    tree = pytest.importorskip("scipy.spatial").cKDTree
+    scene = the_scene()
+    sweeps = the_sweeps(scene)
+    truth = points_of(scene, 0)
+    parts = [sweeps.as_fired(number, part) for number, part in enumerate(sweeps.points(truth))]
+    fired = replace(truth, positions=np.concatenate(parts).round(4))
+    data = DataSet(Storage.at(tmp_path), kind)
+    row = JobRow(0, "00")
+    data.write_job(row, fired, replace(sweeps, coordinates="sensor"))
+    write_table(data.storage, [], lambda: [row])
+    data.finish([row])
+    view = JobList(tmp_path).view_of(0)
+    found = np.stack([view.points.values(name, slice(None)) for name in "xyz"], axis=1)
+    apart_m = tree(truth.positions).query(found)[0].max()
+    assert (apart_m < 2e-3) == (kind != "mcap")
+    assert ("The points are as fired" in view.note) == (kind == "mcap")
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,14 @@ from tests.simulated_drives import simulated_drive
 import lidarfiles
 from lidarfiles import open_recording, save_cloud
 from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
+from lidarreal import compare
 from lidarreal.augmentation.conversion import open_converter
+from lidarreal.comparing.surveys.survey_clouds import SurveyCloud
 from lidarreal.reconstruction.alignment import first_alignment
 from lidarreal.reconstruction.motion import Motion
 from lidarreal.reconstruction.odometry import find_poses
@@ -25,6 +28,7 @@ from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarsim import Scene, Sensor, Survey, Track, box, load_sensor
 from lidarsim.columns.sweep import Sweep
 from lidarsim.io.storage import Storage
+from lidarsim.sweeps.sweeps import SWEEPS_FILE
 
 SWEEPS = 8
 SPEED_M_S = 12.0
@@ -52,7 +56,7 @@ def drive(coordinates="world", scene=None, sensor=None):
     """Return the recorded sweeps of a drive, by default along the hall: a cloud in memory."""
     survey = Survey(
         sensor or Sensor.grid(360, 16, vertical_fov_deg=30),
-        trajectory=Track([0, 1], [[-9, -6, 2], [SPEED_M_S - 9, -6, 2]]),
+        trajectory=Track([0, 1], [[-11, -6, 2], [SPEED_M_S - 11, -6, 2]]),
         steps=36 * SWEEPS,
         columns=["time", "ray", "range", "intensity", "reflectivity", "class"],
         coordinates=coordinates,
@@ -195,3 +199,72 @@ def test_points_as_fired_without_times_are_compensated_by_their_azimuth():
     assert aligned(recording(None))[1].motion is Motion.COMPENSATED
     assert aligned(recording(True))[1].motion is Motion.COMPENSATED
     assert aligned(recording(False))[1].motion.is_turning
+
+
+# {name: file, format and options of recordings with points as fired}
+AS_FIRED = {
+    "result": ("new/cloud.ply", None, {}),
+    "mcap": ("new.mcap", "mcap", {}),
+    "webdataset": ("new", "webdataset", {}),
+    **{
+        f"data set {name}": ("", None, {}) for name in ("webdataset", "parquet", "images", "folder")
+    },
+}
+
+
+def write_as_fired(folder, key):
+    """Write a drive with points as fired, and return its path."""
+    file, name, options = AS_FIRED[key]
+    cloud = drive("sensor")
+    if key.startswith("data set"):
+        kind = key.removeprefix("data set ")
+        ExportSpec(DATA_SETS[kind]).check_installed()
+        return write_data_set(folder, kind, cloud)
+    if name is None:
+        (folder / "new").mkdir()
+        save_cloud(cloud, folder / file)
+        cloud.sweeps().save(folder / "new" / SWEEPS_FILE)
+        return folder / "new"
+    ExportSpec(name).check_installed()
+    save_cloud(cloud, folder / file, format=name, **options)
+    return folder / file
+
+
+@pytest.mark.parametrize("key", AS_FIRED)
+def test_points_as_fired_are_compared_in_world_coordinates(key, tmp_path):
+    """At the pose of its sweep, a point would be up to 1.2 m from the surface."""
+    path = write_as_fired(tmp_path, key)
+    truth = drive()
+    cloud = replace(truth, sweeps=None)
+    found = compare(cloud, path).figures
+    for way in ("a_to_b", "b_to_a"):
+        assert found["distances"][way]["max_m"] < 3 * TOLERANCE_M
+    points, _ = SurveyCloud.open(path, "survey").sample(1_000_000)
+    assert len(points) == len(truth)
+    assert cKDTree(truth.positions).query(points.positions)[0].max() < 3 * TOLERANCE_M
+
+
+@pytest.mark.parametrize("name", ["pcd", "images"])
+def test_points_as_fired_without_times_of_sweeps_are_noted(name, tmp_path):
+    save_cloud(drive("sensor"), tmp_path / "new", format=name)
+    cloud = replace(drive(), sweeps=None)
+    notes = compare(cloud, tmp_path / "new").figures["notes"]
+    assert any("as fired, but not the times of its sweeps" in note for note in notes)
+    survey = SurveyCloud.open(tmp_path / "new", "survey")
+    survey.sample(1_000_000)
+    assert any("as fired, but not the times of its sweeps" in note for note in survey.notes)
+
+
+def test_points_as_fired_without_times_are_noted():
+    fired = open_recording(drive("sensor"), name="drive")
+
+    def read(number):
+        sweep = fired[number]
+        return Sweep(sweep.points, {"channel": sweep.columns["channel"]}, pose=sweep.pose)
+
+    sweeps = PosedSweeps(Recording("drive", SWEEPS, read, compensated=False))
+    assert sweeps.read(1).firing_poses is None
+    (note,) = sweeps.notes
+    assert note.startswith("drive contains points as fired, but not the times of its points")
+    still = PosedSweeps(Recording("drive", 1, read, compensated=False))
+    assert still.read(0).firing_poses is None and not still.notes

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, as_sentence
@@ -124,6 +125,20 @@ class SavedSweeps:
         job, number = self._locate(index)
         return job.read(number)
 
+    def read_fired(self, index: int) -> Sweep:
+        """Read a sweep whose points are as fired, with its `firing_poses`.
+
+        Raises the same errors as reading an item. The sweeps must have firing poses (see
+        `have_firing_poses`).
+        """
+        job, number = self._locate(index)
+        sweep = job.read(number)
+        columns = dict(sweep.columns)
+        # Range images have times, but no scans, which then only correct jumps of the clock.
+        columns.setdefault("scan", np.full(len(sweep), job.sweeps.scans[number]))
+        poses = job.sweeps.firing_poses(number, Cloud(sweep.points, columns))
+        return sweep.replace(firing_poses=poses)
+
     def _locate(self, index: int) -> tuple[_OpenJob, int]:
         """Return the open job that contains a sweep, and the sweep's index in this job."""
         position = operator.index(index)
@@ -152,6 +167,13 @@ class SavedSweeps:
             for job in dict.fromkeys(run.job.name for run in self._runs)
         }
         return stated.pop() if len(stated) == 1 else None
+
+    def have_firing_poses(self) -> bool:
+        """Return whether the points of all sweeps are as fired, and their firing poses are known.
+
+        They are unknown in bags, whose points have no times on the clock of the survey.
+        """
+        return self.are_compensated() is False and self._dataset.spec.cloud_format.frame == "cloud"
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return the sweeps as a `torch.utils.data.IterableDataset`.

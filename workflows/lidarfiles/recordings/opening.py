@@ -210,5 +210,9 @@ def _open_data_set(source: RecordingSource) -> Recording:
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
     source.selected.add(source.sensor or "")
     return source.recording(
-        len(saved), saved.__getitem__, compensated=saved.are_compensated(), noise_classes=None
+        len(saved),
+        saved.__getitem__,
+        compensated=saved.are_compensated(),
+        fired=saved.read_fired if saved.have_firing_poses() else None,
+        noise_classes=None,
     )

@@ -320,6 +320,7 @@ def _show_coverage(
 
     The visible area is the area that can be seen from the stations of the scenario.
     """
+    from lidarfiles.clouds.posed_sweeps import PosedSweeps
     from lidarfiles.recordings.opening import open_recording
     from lidarreal.comparing.compared_sweep import compared_in_world
     from lidarreal.comparing.stated_frames import StatedFrame, check_same_systems
@@ -346,13 +347,13 @@ def _show_coverage(
     )
     cloud_frame = StatedFrame.from_recording(recording, recording.name)
     more = [*check_same_systems([cloud_frame, scene_frame]), *recording.omission_notes]
-    positions = _station_positions(prepared)
-    clouds = (compared_in_world(recording, number).points for number in range(recording.count))
+    sweeps = PosedSweeps(recording)
+    clouds = (compared_in_world(sweeps, number).points for number in range(recording.count))
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             prepared.scene,
             prepared.survey.mounted_sensors[0].sensor,
-            positions,
+            _station_positions(prepared),
             clouds,
             targets=targets,
             within_m=within_m,
@@ -364,13 +365,13 @@ def _show_coverage(
             "poses and the unit of the scene."
         )
     figures = _coverage_figures(coverage, prepared) | {
-        "stations": len(positions),
+        "stations": prepared.survey.path.stations,
         "within_m": within_m,
-        "notes": [*notes, *more],
+        "notes": [*notes, *more, *sweeps.notes],
     }
     head = (
         f"{figures['reachable_m2']:,.0f} m²{_target_phrase(targets)} are reachable from "
-        f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
+        f"{plural(figures['stations'], 'station')}, and {figures['covered']:.1%} of this area is "
         f"within {within_m:g} m of a point"
     )
     table = _object_lines(prepared.scene.names, coverage)

@@ -31,6 +31,10 @@ from .recorded import finite_points, merge_sweeps
 
 MAX_LISTED = 1000  # maximum number of finished and of failed jobs in the table
 _MAX_VIEWS = 4  # maximum number of jobs whose points are kept in memory
+_AS_FIRED = (
+    "The points are as fired, but their times are unknown. All points of a sweep are placed at the "
+    "pose of the sweep."
+)
 
 
 class JobList:
@@ -131,11 +135,17 @@ class JobList:
         saved = Sweeps.load(self._storage.path(name), partial(self._storage.read, name))
         saved = replace(saved, coordinates="world")
         loaded = sweeps(self.location, jobs=[row.number])
-        read = [finite_points(sweep.replace(points=sweep.in_world())) for sweep in loaded]
+        has_firings = loaded.have_firing_poses()
+        read_sweep = loaded.read_fired if has_firings else loaded.__getitem__
+        note = "" if has_firings or loaded.are_compensated() else _AS_FIRED
+        posed = map(read_sweep, range(len(loaded)))
+        read = [finite_points(sweep.replace(points=sweep.in_world())) for sweep in posed]
         scans = saved.scans[: len(read)].astype(np.int32).repeat([len(sweep) for sweep in read])
         cloud = merge_sweeps(read, scan=scans)
         title = f"job {row.name} - {self.title}"
-        return View(ScanOrderedPoints(cloud), None, saved, title=title, downloads=downloads())
+        return View(
+            ScanOrderedPoints(cloud), None, saved, note=note, title=title, downloads=downloads()
+        )
 
 
 def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:

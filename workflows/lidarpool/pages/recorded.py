@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.column_names import COLORS, with_standard_names
@@ -285,17 +286,18 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
     """Read sweeps up to the point limit, and return the points, the sweeps and notes."""
     recordings = [*sensors.values()]
     ordered, is_timed = _sort_sweeps(recordings)
-    frame_poses = [_frame_poses(recording) for recording in recordings]
-    if any(sensor_poses is None for sensor_poses in frame_poses):
-        frame_poses = [None] * len(recordings)  # poses cannot be combined if a sensor has none
+    posed = [PosedSweeps(recording) for recording in recordings]
+    # Poses cannot be combined if a sensor has none.
+    are_combined = all(sweeps.recorded_poses is not None for sweeps in posed)
     read: list[Sweep] = []
     poses: list[Floats | None] = []
     count = 0
     for timed in ordered:
-        sweep = recordings[timed.sensor][timed.number].returns()
-        sensor_poses = frame_poses[timed.sensor]
-        if sweep.pose is None and sensor_poses is not None:
-            sweep = sweep.replace(pose=sensor_poses[timed.number])
+        recording = recordings[timed.sensor]
+        if are_combined or recording.read_poses is None:
+            sweep = posed[timed.sensor].read(timed.number)
+        else:
+            sweep = recording[timed.number].returns()
         poses.append(sweep.pose)
         read.append(
             finite_points(sweep if sweep.pose is None else sweep.replace(points=sweep.in_world()))
@@ -303,7 +305,7 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
         count += len(read[-1])
         if count > MAX_POINTS:
             break
-    notes = []
+    notes = [f"{note}." for sweeps in posed for note in sweeps.notes]
     if len(poses) < len(ordered):
         notes.append(f"Only the first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
     are_stations = all(recording.stations for recording in recordings)
@@ -313,15 +315,6 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
     cloud = merge_sweeps(read, scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
     sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])
     return cloud, replace(sweeps, stations=len(sweeps) if are_stations else 1), notes
-
-
-def _frame_poses(recording: Recording) -> Floats | None:
-    """Return the pose of each sweep from the frames of a bag, or None.
-
-    The array has shape (n, 4, 4).
-    """
-    has_frames = recording.read_poses is not None
-    return recording.poses(range(len(recording))) if has_frames else None
 
 
 def recorded_sweeps(

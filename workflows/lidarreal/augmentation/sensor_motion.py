@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import path_of_sweep, poses_at
 from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
-from lidarsim.motion.rotations import quaternions_of
-from lidarsim.motion.trajectory import Track, full_poses
+from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import Floats
 
 _MAX_LOCAL_M = 1e4  # distance from the origin beyond which the world frame is shifted
@@ -110,7 +110,7 @@ class SensorMotion:
         path = self._path(number)
         if path is None or sweep.compensated is None:
             return SweepMotion(single, stamp_pose=pose)
-        return SweepMotion(_poses_at(path, times_s), stamp_pose=pose)
+        return SweepMotion(poses_at(path, times_s), stamp_pose=pose)
 
     def _compensated_path(self, sweep: Sweep, number: int) -> Track | None:
         """Return the trajectory during a compensated sweep, or None if it is unknown."""
@@ -119,46 +119,15 @@ class SensorMotion:
         return self._path(number)
 
     def _path(self, number: int) -> Track | None:
-        """Return the trajectory of the sensor around a sweep, or None if it is unknown.
-
-        Time 0 of the trajectory is the timestamp of the previous sweep.
-        """
+        """Return the trajectory of the sensor around a sweep, or None if it is unknown."""
         stamps_ns = self.recording.stamps_ns
-        if stamps_ns is None or self.poses is None or len(self.poses) < 2:
+        if stamps_ns is None or self.poses is None:
             return None
-        count = len(self.poses)
-        pose = self.poses[number]
-        step_s = 1e-9 * float(np.median(np.diff(stamps_ns)))
-        after, after_s = None, step_s
-        before, before_s = None, step_s
-        if number + 1 < count:
-            after = self.poses[number + 1]
-            after_s = 1e-9 * float(stamps_ns[number + 1] - stamps_ns[number])
-        if number:
-            before = self.poses[number - 1]
-            before_s = 1e-9 * float(stamps_ns[number] - stamps_ns[number - 1])
-        if after is None and before is not None:
-            after, after_s = pose @ np.linalg.inv(before) @ pose, before_s
-        if before is None and after is not None:
-            before, before_s = pose @ np.linalg.inv(after) @ pose, after_s
-        if before is None or after is None or before_s <= 0 or after_s <= 0:
-            return None
-        samples = np.stack([before, pose, after])
-        return Track(
-            np.array([-before_s, 0.0, after_s]),
-            samples[:, :3, 3],
-            quaternions_of(samples[:, :3, :3]),
-            beyond="hold",
-        )
-
-
-def _poses_at(path: Track, times_s: Floats) -> tuple[Floats, Floats]:
-    """Return positions (n, 3) and rotations (n, 3, 3) at times relative to the sweep."""
-    return full_poses(path, 0, 1e9 * (np.asarray(times_s) - path.times_s[0]))
+        return path_of_sweep(self.poses.__getitem__, stamps_ns[: len(self.poses)], number)
 
 
 def _relative_poses(path: Track, pose: Floats, times_s: Floats) -> tuple[Floats, Floats]:
     """Return positions (n, 3) and rotations (n, 3, 3) in the frame of a sweep with a given pose."""
-    positions, rotations = _poses_at(path, times_s)
+    positions, rotations = poses_at(path, times_s)
     back = np.linalg.inv(pose)
     return positions @ back[:3, :3].T + back[:3, 3], back[:3, :3] @ rotations

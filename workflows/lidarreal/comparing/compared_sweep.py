@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.errors import LidarError
@@ -29,15 +30,17 @@ def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False
     return sweep
 
 
-def compared_in_world(recording: Recording, number: int) -> Sweep:
+def compared_in_world(sweeps: PosedSweeps, number: int) -> Sweep:
     """Read the returns of a sweep, or of a portion of a cloud, in world coordinates.
 
     The only column is `intensity`, if the recording has it.
 
     Raises LidarError if the recording cannot be read, or if the pose of the sweep is unknown.
     """
-    sweep = with_compared_columns(recording[number])
-    sweep = sweep.with_columns(intensity=sweep.intensity).returns()
+    recording = sweeps.recording
+    sweep = recording[number].returns() if recording.is_cloud else sweeps.read(number)
+    sweep = with_compared_columns(sweep)
+    sweep = sweep.with_columns(intensity=sweep.intensity)
     check_reach(recording, sweep)
     if recording.is_cloud:
         return sweep

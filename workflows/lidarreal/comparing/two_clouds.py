@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording, SeveralSensorsError
 from lidarfiles.datasets.figures import rank_correlation
 from lidarfiles.open3d_access.neighbors import nearest_neighbors
@@ -319,11 +320,13 @@ class _Comparing:
         count = recording.point_count
         fraction = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
+        sweeps = PosedSweeps(recording)
         for number in range(recording.count):
-            part = compared_in_world(recording, number)
+            part = compared_in_world(sweeps, number)
             if fraction < 1:
                 part = part.select(even_indices(len(part), round(fraction * len(part))))
             parts.append(part)
+        self.notes += sweeps.notes
         if fraction == 1 or not parts:
             return Sweep.concatenate(parts)
         self.add_note(

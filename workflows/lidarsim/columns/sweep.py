@@ -256,7 +256,13 @@ class Sweep:
         )
 
     def in_world(self) -> Floats:
-        """Transform the points to the world frame. The pose must be known."""
+        """Transform the points to the world frame.
+
+        Points as fired are transformed with their firing poses, if these are known. Otherwise, the
+        pose must be known.
+        """
+        if self.firing_poses is not None:
+            return np.asarray(self.firing_poses.to_world(self.points))
         assert self.pose is not None
         return np.asarray(self.points @ self.pose[:3, :3].T + self.pose[:3, 3])
 

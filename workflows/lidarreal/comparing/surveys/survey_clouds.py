@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording, SeveralSensorsError
 from lidarfiles.parts.parts import StoredCloud
 from lidarfiles.recordings.opening import open_recording
@@ -104,7 +105,12 @@ class SurveyCloud:
     def notes(self) -> list[str]:
         """Notes of the recordings, including those about points that were omitted."""
         notes = [note for one in self.recordings for note in (*one.notes, *one.omission_notes)]
+        notes += [note for sweeps in self._sweeps for note in sweeps.notes]
         return list(dict.fromkeys(notes))
+
+    @cached_property
+    def _sweeps(self) -> tuple[PosedSweeps, ...]:
+        return tuple(PosedSweeps(recording) for recording in self.recordings)
 
     @property
     def point_count(self) -> int | None:
@@ -140,11 +146,11 @@ class SurveyCloud:
         total = sum(recording.count for recording in self.recordings)
         unit = "parts" if self.recordings[0].is_cloud else "sweeps"
         done = 0
-        for number, recording in enumerate(self.recordings):
-            for index in range(recording.count):
+        for number, sweeps in enumerate(self._sweeps):
+            for index in range(sweeps.recording.count):
                 done += 1
                 self.show(f"reading {self.name}", done, total, unit)
-                part = _world_points(recording, index, with_ranges=with_ranges)
+                part = _world_points(sweeps, index, with_ranges=with_ranges)
                 if len(part):
                     sensor = np.full(len(part), number, np.int64)
                     part = part.replace(columns={**part.columns, SENSOR: sensor})
@@ -187,12 +193,15 @@ class SurveyCloud:
         return points, [] if share == 1 else [note]
 
 
-def _world_points(recording: Recording, number: int, *, with_ranges: bool) -> Sweep:
+def _world_points(sweeps: PosedSweeps, number: int, *, with_ranges: bool) -> Sweep:
     """Return the returns of a sweep in world coordinates, with the position of its scanner."""
-    # Points as fired are at their ranges from the sensor. They are read only if required, because
-    # they are transformed with a pose each.
-    as_fired = recording.fired is not None and (with_ranges or recording.compensated is False)
-    sweep = recording.read_fired(number) if as_fired else recording[number].returns()
+    recording = sweeps.recording
+    if recording.is_cloud:
+        sweep = recording[number].returns()
+    else:
+        # Points as fired are at their ranges from the sensor. They are read only if required,
+        # because they are transformed with a pose each.
+        sweep = sweeps.read(number, as_fired=with_ranges)
     check_reach(recording, sweep)
     scanner = sweep.scanner
     if scanner is not None:
@@ -207,12 +216,10 @@ def _world_points(recording: Recording, number: int, *, with_ranges: bool) -> Sw
     # Files of scans without a pose are read with an identity matrix.
     if scanner is None and (recording.read_poses or not np.array_equal(sweep.pose, np.eye(4))):
         scanner = sweep.pose[:3, 3]
-    poses = sweep.firing_poses
     columns = sweep.columns
     if with_ranges and "range" not in columns:
         columns = {**columns, "range": np.linalg.norm(sweep.points, axis=1)}
-    points = sweep.in_world() if poses is None else poses.to_world(sweep.points)
-    return sweep.replace(points=points, columns=columns, scanner=scanner)
+    return sweep.replace(points=sweep.in_world(), columns=columns, scanner=scanner)
 
 
 def _shifted(part: Sweep, shift_m: Floats) -> Sweep:
