@@ -177,6 +177,23 @@ def room_points(pose, seed):
     return (world - pose[:3, 3]) @ pose[:3, :3]
 
 
+def test_registration_continues_where_sweeps_are_missing():
+    """The sensor moves by 0.5 m between sweeps. Eleven sweeps are missing, or 6 m."""
+    pytest.importorskip("small_gicp")
+    numbers = np.array([0, 1, 2, 3, 4, 16, 17, 18])
+    truth = np.stack([pose_of((0.5 * number, 0.1 * number, 0.0)) for number in numbers])
+    stamps_s = 0.1 * numbers
+    recording = Recording(
+        "room",
+        len(numbers),
+        lambda number: Sweep(room_points(truth[number], number)),
+        read_stamps=lambda: 1e9 * stamps_s,
+    )
+    found = find_poses(RecordedSweeps.from_recording(recording), None)
+    assert found.source == "from registration"
+    np.testing.assert_allclose(found.matrices, truth, atol=0.01)
+
+
 def test_registration_finds_poses_from_the_first_sweep():
     truth = path(count=8)
     truth[:, :3, 3] *= 0.5

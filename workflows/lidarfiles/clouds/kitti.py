@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from lidarsim.io.numbered_files import (
     frames_in_words,
     frames_without_file,
     rows_of_frames,
+    skipped_frames,
     sort_by_number,
 )
 from lidarsim.io.time_units import seconds_of
@@ -30,6 +32,7 @@ from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
+from lidarsim.words import join_names
 
 from . import kitti_boxes
 from .boxes import Boxes
@@ -43,6 +46,8 @@ _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 CALIBRATION_FILE = kitti_boxes.CALIBRATION_FILE
 CLASS_FILE = "semantic-kitti.yaml"
+_STAMP_FILE = "timestamps.txt"  # in the folder `_RAW_FOLDER` of a raw drive
+_RAW_FOLDER = "velodyne_points"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 # Upper limits of the truncation levels 0 and 1, as for easy and hard objects in the detection
@@ -382,28 +387,22 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
     """Open a folder of sweeps, with labels, poses and times if they exist."""
     files = point_files(points)
     calibration = folder / CALIBRATION_FILE
-    notes = []
-
-    def of_frames(rows: Floats, table: str) -> Floats:
-        """Return the rows that belong to point files. If there are other rows, add a note."""
-        indices = rows_of_frames(files, len(rows), table, "point files")
-        if surplus := frames_without_file(files, len(rows)):
-            notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
-        return rows[indices]
-
-    poses: Floats | None = None
-    if (folder / "poses.txt").exists():
-        rows = of_frames(_matrices(folder / "poses.txt"), "poses.txt")
-        poses = lidar_poses(rows, calibration)
-        if not calibration.exists():
-            notes.append(f"has no {CALIBRATION_FILE}, so its poses are assumed to be lidar poses")
-    times_ns: Floats | None = None
-    if (folder / "times.txt").exists():
-        seconds = np.loadtxt(folder / "times.txt", ndmin=1)
-        times_ns = 1e9 * seconds_of(
-            seconds, None, advice=("specify the times in times.txt in seconds")
+    tables = _FrameTables(files)
+    poses = tables.read_poses(folder)
+    times_ns = tables.read_times_ns(folder, points)
+    notes = tables.notes
+    if poses is not None and not calibration.exists():
+        notes.append(f"has no {CALIBRATION_FILE}, so its poses are assumed to be lidar poses")
+    if times_ns is None and (skipped := skipped_frames(files)):
+        notes.append(
+            f"has no point file for {frames_in_words(skipped)} and no times, so its sweeps are "
+            "treated as evenly spaced"
         )
-        times_ns = of_frames(times_ns, "times.txt")
+    if beside := _tables_beside(folder, points):
+        notes.append(
+            f"is read without {join_names(beside)} in its parent folder. Specify the parent folder "
+            "to use them"
+        )
 
     def read(number: int) -> Sweep:
         file = files[number]
@@ -422,6 +421,86 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
         sequence=name,
         calibration=calibration,
     )
+
+
+@dataclass
+class _FrameTables:
+    """Tables of a sequence, with a row for each frame, and notes about them."""
+
+    files: list[Path]  # point files
+    notes: list[str] = field(default_factory=list)
+
+    def read_poses(self, sequence: Path) -> Floats | None:
+        """Return the lidar poses of the sweeps, or None if there are none.
+
+        In the odometry benchmark, the poses of `sequences/00` are in `poses/00.txt`.
+        """
+        names = ["poses.txt"]
+        if sequence.absolute().parent.name == "sequences":
+            names.append(f"../../poses/{sequence.absolute().name}.txt")
+        for name in names:
+            if (sequence / name).exists():
+                rows = self._of_files(_matrices(sequence / name), name.removeprefix("../../"))
+                return lidar_poses(rows, sequence / CALIBRATION_FILE)
+        return None
+
+    def read_times_ns(self, sequence: Path, points: Path) -> Floats | None:
+        """Return the timestamps of the sweeps in nanoseconds, or None if there are none."""
+        if (sequence / "times.txt").exists():
+            seconds = np.loadtxt(sequence / "times.txt", ndmin=1)
+            times_ns = 1e9 * seconds_of(
+                seconds, None, advice=("specify the times in times.txt in seconds")
+            )
+            return self._of_files(times_ns, "times.txt")
+        stamps = points.absolute().parent / _STAMP_FILE
+        if stamps.parent.name != _RAW_FOLDER or not stamps.exists():
+            return None
+        times_ns = self._of_files(_timestamps_ns(stamps), _STAMP_FILE)
+        if np.isnan(times_ns).any():
+            file = self.files[int(np.isnan(times_ns).argmax())]
+            raise ValueError(
+                f"{_STAMP_FILE} has no time for {file.name}. Add it, or remove the file"
+            )
+        return times_ns
+
+    def _of_files(self, rows: Floats, table: str) -> Floats:
+        """Return the rows that belong to point files. If there are other rows, add a note."""
+        indices = rows_of_frames(self.files, len(rows), table, "point files")
+        if surplus := frames_without_file(self.files, len(rows)):
+            self.notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
+        return rows[indices]
+
+
+def _tables_beside(folder: Path, points: Path) -> list[str]:
+    """Return the tables of a sequence that are not used, because only its point folder is read."""
+    if folder.absolute() != points.absolute() or points.absolute().name != "velodyne":
+        return []
+    parent = points.absolute().parent
+    return [name for name in ("poses.txt", "times.txt") if (parent / name).exists()]
+
+
+def _timestamps_ns(path: Path) -> Floats:
+    """Read the timestamps of a raw drive in nanoseconds since 1970.
+
+    The file has a row for each frame, also for frames that were not recorded. Rows without a time
+    are NaN.
+
+    Raises ValueError with the line number if a line is invalid.
+    """
+    lines = read_input_text(path).rstrip().splitlines()
+    times_ns = np.full(len(lines), np.nan)
+    for row, line in enumerate(lines):
+        if not line.strip():
+            continue
+        try:
+            stamp = np.datetime64(line.strip(), "ns")
+        except ValueError as error:
+            raise ValueError(
+                f"{path.name}: line {row + 1} is not a time such as 2011-09-26 13:02:25.594360375"
+            ) from error
+        if not np.isnat(stamp):
+            times_ns[row] = stamp.astype(np.int64)
+    return times_ns
 
 
 def _class_names(sequence: Path) -> dict[int, str]:

@@ -13,7 +13,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.environment.extras import reading
 from lidarsim.io.input_files import open_input
-from lidarsim.io.numbered_files import sort_by_number
+from lidarsim.io.numbered_files import frames_in_words, skipped_frames, sort_by_number
 from lidarsim.numerics.arrays import AnyArray
 from lidarsim.scene.colors import pack_as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
@@ -123,6 +123,12 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
                 )
         return sweep
 
+    notes = []
+    if skipped := skipped_frames(files):
+        notes.append(
+            f"has no file for {frames_in_words(skipped)} and no times, so its sweeps are treated "
+            "as evenly spaced"
+        )
     first_intensity = PerProcess(lambda: _intensity_name(read_pcd(files[0])[0]))
     return source.recording(
         len(files),
@@ -130,6 +136,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         meters=source.chosen_meters(),
         compensated=_stated_compensation(files[0]),
         files=[path.name for path in files],
+        notes=source.prefix_notes(notes),
     )
 
 

@@ -11,9 +11,10 @@ from lidarfiles.clouds.kitti import CALIBRATION_FILE, lidar_poses
 from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory_files import load_trajectory, read_kitti_poses
-from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.words import plural
 
+from .motion import MotionStep
 from .recorded_sweeps import RecordedSweeps
 
 _VOXELS_OF_REACH = 75  # range of the sensor in voxels of the map
@@ -101,11 +102,12 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses = recorded
         source = "from the recording"
     else:
-        poses = _register_sweeps(sweeps)
+        poses = _register_sweeps(sweeps, _step_counts(times_s))
         source = "from registration"
         fraction = 0.5
         first_s = 0.0 if sweeps.point_times is None else sweeps.point_times.first_s
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        steps_m /= _step_counts(times_s)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1
             raise LidarError(
@@ -185,8 +187,21 @@ def _sensor_poses(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Flo
     return poses
 
 
-def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
+def _step_counts(times_s: Floats) -> Ints:
+    """Return the number of sweep intervals between consecutive sweeps.
+
+    It is greater than 1 where sweeps are missing. The shape is (s - 1,).
+    """
+    steps_s = np.diff(times_s)
+    counts = np.rint(steps_s / np.median(steps_s)) if len(steps_s) else steps_s
+    return np.maximum(counts, 1).astype(np.int64)
+
+
+def _register_sweeps(sweeps: RecordedSweeps, step_counts: Ints) -> Floats:
     """Register each sweep to a map of the earlier sweeps.
+
+    The motion in a sweep interval is assumed to continue. `step_counts` (s - 1,) are the numbers of
+    intervals between consecutive sweeps.
 
     Each voxel of the map and each point has a covariance, so points can slide along planes.
     Point-to-point odometry finds hardly any motion on level ground, because the rings of all sweeps
@@ -208,7 +223,8 @@ def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
     step = np.eye(4)
     for number in range(sweeps.count):
         sweep = sweeps.read_surfaces(number)
-        pose = poses[-1] @ step if poses else np.eye(4)
+        count = int(step_counts[number - 1]) if poses else 1
+        pose = poses[-1] @ np.linalg.matrix_power(step, count) if poses else np.eye(4)
         if len(sweep) >= _MIN_POINTS:
             points, _ = small_gicp.preprocess_points(
                 sweep.points, voxel_m / _POINTS_OF_VOXEL, num_threads=1
@@ -226,5 +242,7 @@ def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
             voxels.insert(points, pose)
         if poses:
             step = np.linalg.inv(poses[-1]) @ pose
+            if count > 1:
+                step = MotionStep.between(poses[-1], pose).fraction(1 / count)
         poses.append(pose)
     return np.array(poses)

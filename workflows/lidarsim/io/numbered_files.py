@@ -18,6 +18,7 @@ from ..words import plural
 
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?)")
 _FRAME_DIGITS = 10  # number of digits in KITTI raw data; longer numbers are timestamps
+_MAX_FRAME = 9_999_999  # larger numbers are times
 _MAX_RUNS = 4  # maximum number of frame ranges in a message
 
 
@@ -92,6 +93,21 @@ def frames_without_file(files: Sequence[Path], row_count: int) -> list[int]:
     """Return the numbers of the table rows that have no file."""
     frames = {int(file.stem) for file in files if file.stem.isdecimal()}
     return sorted({*range(row_count)} - frames) if frames else []
+
+
+def skipped_frames(files: Sequence[Path]) -> list[int]:
+    """Return the frame numbers that are missing between files in ascending order.
+
+    The list is empty if not all names are frame numbers, or if the numbers are evenly spaced, for
+    example if only every tenth frame was kept.
+    """
+    if not all(file.stem.isdecimal() for file in files):
+        return []
+    frames = np.array([int(file.stem) for file in files])
+    steps = np.diff(frames)
+    if not len(steps) or frames[-1] > _MAX_FRAME or (steps == steps[0]).all():
+        return []
+    return sorted({*range(int(frames[0]), int(frames[-1]))} - {*frames.tolist()})
 
 
 def frames_in_words(frames: Sequence[int]) -> str:
