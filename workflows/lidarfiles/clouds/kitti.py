@@ -398,11 +398,8 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
             f"has no point file for {frames_in_words(skipped)} and no times, so its sweeps are "
             "treated as evenly spaced"
         )
-    if beside := _tables_beside(folder, points):
-        notes.append(
-            f"is read without {join_names(beside)} in its parent folder. Specify the parent folder "
-            "to use them"
-        )
+    if folder.absolute() == points.absolute():
+        notes += _notes_on_tables(folder.absolute())
 
     def read(number: int) -> Sweep:
         file = files[number]
@@ -471,12 +468,21 @@ class _FrameTables:
         return rows[indices]
 
 
-def _tables_beside(folder: Path, points: Path) -> list[str]:
-    """Return the tables of a sequence that are not used, because only its point folder is read."""
-    if folder.absolute() != points.absolute() or points.absolute().name != "velodyne":
-        return []
-    parent = points.absolute().parent
-    return [name for name in ("poses.txt", "times.txt") if (parent / name).exists()]
+def _notes_on_tables(points: Path) -> list[str]:
+    """Return notes on tables that are not used, because only a folder with points is read."""
+    names = [name for name in ("poses.txt", "times.txt") if (points.parent / name).exists()]
+    if points.name == "velodyne" and names:
+        return [
+            f"is read without {join_names(names)} in its parent folder. Specify the parent folder "
+            "to use them"
+        ]
+    tables = next(points.parent.parent.glob("v1.0-*/sample_data.json"), None)
+    if points.parent.name in ("samples", "sweeps") and tables is not None:
+        return [
+            f"is read without the poses and times in the tables of nuScenes. Specify the folder "
+            f"{tables.parents[1]} to use them"
+        ]
+    return []
 
 
 def _timestamps_ns(path: Path) -> Floats:

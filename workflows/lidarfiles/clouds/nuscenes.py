@@ -29,6 +29,7 @@ from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
+from lidarsim.words import plural
 
 from ..identity.fingerprint import fingerprint
 from .boxes import Boxes, json_number
@@ -588,18 +589,28 @@ def _open_data_set(source: RecordingSource) -> Recording:
     with reading(source.name):
         tables = NuScenesTables(folder)
         lidars = {
-            name: _recording(source, tables, rows) for name, rows in tables.lidar_rows().items()
+            name: _recording(source, tables, rows, tables.omitted[name])
+            for name, rows in tables.lidar_rows().items()
         }
     return source.select_sensor(lidars)
 
 
-def _recording(source: RecordingSource, tables: NuScenesTables, rows: list[_Row]) -> Recording:
+def _recording(
+    source: RecordingSource, tables: NuScenesTables, rows: list[_Row], omitted: int
+) -> Recording:
+    notes = []
+    if omitted:
+        notes.append(
+            f"contains only the {plural(len(rows), 'key frame')} of this lidar. The files of "
+            f"{plural(omitted, 'sweep')} between them, in the folder sweeps, are missing"
+        )
     times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
     return source.recording(
         len(rows),
         lambda number: tables.read(rows[number]),
         read_stamps=times_ns.tolist,
         read_boxes=lambda: tables.boxes(rows),
+        notes=source.prefix_notes(notes),
         compensated=states_compensation(str(tables.scene(rows[0]).get("description"))),
         sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
     )
@@ -635,6 +646,8 @@ class NuScenesTables:
         self._calibrated = self.table("calibrated_sensor")
         self._scenes = self.table("scene")
         self._samples = self.table("sample")
+        # {lidar channel, with the scene as in `lidar_rows`: number of sweeps that are not stored}
+        self.omitted: dict[str, int] = {}
         self._labels: dict[str, str] = {}  # {token of a sweep: its label file}
         for row in self.table("lidarseg", optional=True).values():
             self._labels[row["sample_data_token"]] = row["filename"]
@@ -670,7 +683,8 @@ class NuScenesTables:
     def lidar_rows(self) -> dict[str, list[_Row]]:
         """Return the sweeps of each lidar channel, sorted by time.
 
-        If there are several scenes, the name of the scene precedes the name of the channel.
+        If there are several scenes, the name of the scene precedes the name of the channel. Sweeps
+        between key frames are omitted if their folder does not exist.
         """
         sensors = self.table("sensor")
         rows_of_channel: dict[tuple[str, str], list[_Row]] = {}
@@ -681,12 +695,23 @@ class NuScenesTables:
                 rows_of_channel.setdefault(channel, []).append(row)
                 for name, entry in self._named_files(row):
                     check_name(name, entry)
-        return {
-            f"{scene} {channel}" if self.scene_count > 1 else channel: sorted(
-                rows, key=lambda row: row["timestamp"]
-            )
-            for (scene, channel), rows in sorted(rows_of_channel.items())
-        }
+        found: dict[str, list[_Row]] = {}
+        for (scene, sensor_name), rows in sorted(rows_of_channel.items()):
+            full_name = f"{scene} {sensor_name}" if self.scene_count > 1 else sensor_name
+            stored = self._stored_rows(rows)
+            self.omitted[full_name] = len(rows) - len(stored)
+            found[full_name] = sorted(stored, key=lambda row: row["timestamp"])
+        return found
+
+    def _stored_rows(self, rows: list[_Row]) -> list[_Row]:
+        """Return the key frames, and the other sweeps if their folder exists."""
+        folders = {str(row["filename"]).rpartition("/")[0] for row in rows}
+        missing = {folder for folder in folders if not (self.folder.parent / folder).is_dir()}
+        return [
+            row
+            for row in rows
+            if row["is_key_frame"] or str(row["filename"]).rpartition("/")[0] not in missing
+        ]
 
     def _named_files(self, row: _Row) -> list[tuple[str, str]]:
         """Return the point file of a sweep and, if it exists, its label file.

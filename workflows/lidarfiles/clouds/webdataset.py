@@ -259,6 +259,15 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
             "files named KEY.points.npy."
         )
 
+    notes = []
+    if (
+        not source.path.is_dir()
+        and (count := len([*source.path.absolute().parent.glob("*.tar")])) > 1
+    ):
+        notes.append(
+            f"is one of {count} tar files in its folder. Specify the folder to read all sweeps"
+        )
+
     def recording(samples: list[_Sample]) -> Recording:
         times = [sample.time_ns for sample in samples]
         times_ns = None if None in times else np.array(times, np.float64)
@@ -268,6 +277,7 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
             lambda number: samples[number].read(),
             read_stamps=None if times_ns is None else times_ns.tolist,
             compensated=stated.pop() if len(stated) == 1 else None,
+            notes=source.prefix_notes(notes),
         )
 
     return {sensor: recording(samples) for sensor, samples in samples_of_sensor.items()}

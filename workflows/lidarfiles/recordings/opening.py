@@ -32,6 +32,11 @@ KINDS = (
 _CONVERSIONS = {  # {ending of an unsupported format: advice}
     ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
     ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
+    **dict.fromkeys(
+        (".mcap.zstd", ".mcap.zst", ".db3.zstd", ".db3.zst"),
+        "It is a compressed file of a ROS 2 bag. Specify the folder that contains it and the file "
+        "metadata.yaml.",
+    ),
     ".rrd": "It is a Rerun recording. Open it with the `rerun` command.",
     **dict.fromkeys(
         (".osi", ".osi.gz"), "It is an OSI trace. Use it as the traffic of a scenario."
@@ -189,6 +194,12 @@ def _open_path(source: RecordingSource) -> Recording:
         return _open_data_set(source)
     if (cloud_format := format_of_path(path, source.name)) is not None:
         return cloud_format.open(source)
+    if path.is_dir() and any(_is_bag_file(file) for file in path.iterdir()):
+        raise UnknownFormatError(
+            source.name,
+            "It contains files of a ROS 2 bag, but not the file metadata.yaml. Create it with "
+            "`ros2 bag reindex`, or specify one of the .mcap files.",
+        )
     if path.is_dir() and (endings := sorted({file.suffix.lower() for file in _point_files(path)})):
         raise UnknownFormatError(
             source.name,
@@ -198,6 +209,10 @@ def _open_path(source: RecordingSource) -> Recording:
     file_name = path.name.lower()
     advice = (text for ending, text in _CONVERSIONS.items() if file_name.endswith(ending))
     raise UnknownFormatError(source.name, next(advice, ""))
+
+
+def _is_bag_file(file: Path) -> bool:
+    return bool({".mcap", ".db3"} & {suffix.lower() for suffix in file.suffixes[-2:]})
 
 
 def _point_files(folder: Path) -> list[Path]:

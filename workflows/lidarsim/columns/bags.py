@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 BAG_FILES = (".mcap", ".db3")
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # first bytes of data that is compressed with Zstandard
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 # Point cloud messages of the Livox drivers: livox_ros_driver2 and its predecessors.
 LIVOX_CLOUDS = tuple(
@@ -92,7 +93,20 @@ def open_bag(path: Path, name: str) -> Reader:
                 "it has no ROS 2 messages. Record PointCloud2, or set an OSI trace as the traffic "
                 "of a scenario."
             ) from error
+        _check_messages(bag, path)
     return bag
+
+
+def _check_messages(bag: Reader, path: Path) -> None:
+    """Raise LidarError if the messages in a single file are compressed one by one."""
+    if path.is_dir():  # metadata.yaml states the compression
+        return
+    first = next(bag.messages(), None)
+    if first is not None and bytes(first[2][:4]) == _ZSTD_MAGIC:
+        raise LidarError(
+            "its messages are compressed one by one, which only the file metadata.yaml of the bag "
+            "states. Specify the folder that contains both files."
+        )
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
@@ -351,7 +352,7 @@ def _open_bag(source: RecordingSource) -> Recording:
 
     custom_data = _custom_data(source.path)
     unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
-    notes = [*source.prefix_notes(unstamped)]
+    notes = [*source.prefix_notes((*unstamped, *_split_notes(source.path)))]
 
     def read_poses() -> Floats | None:
         poses, clauses = _sweep_poses(source.path, [*headers()])
@@ -371,6 +372,30 @@ def _open_bag(source: RecordingSource) -> Recording:
         energy_unit=_energy_unit(custom_data, connection, source.intensity),
         sensor=connection.topic,
     )
+
+
+def _split_notes(path: Path) -> tuple[str, ...]:
+    """Return a note, without the name of the bag, if a path is one of several files of a bag."""
+    if path.is_dir():
+        return ()
+    stated = read_metadata(path).get("rosbag2", {}).get("serialized_metadata", "")
+    beside = path.with_name("metadata.yaml")
+    texts = [stated, read_input_text(beside, errors="replace") if beside.exists() else ""]
+    for text in texts:
+        try:
+            found = yaml.safe_load(text)
+        except yaml.YAMLError:
+            continue
+        found = found if isinstance(found, dict) else {}
+        metadata = found.get("rosbag2_bagfile_information", found)
+        listed = metadata.get("relative_file_paths") if isinstance(metadata, dict) else None
+        names = {Path(str(file)).name for file in listed} if isinstance(listed, list) else set()
+        if len(names) > 1 and path.name in names:
+            return (
+                f"is one of {len(names)} files of a bag, so further sweeps, and possibly poses and "
+                "class names, are missing. Specify the folder of the bag to read all files",
+            )
+    return ()
 
 
 def _class_names(bag: Any) -> dict[int, str]:
