@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -21,8 +22,11 @@ from tests.fake_augmenters import (
 
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
+from lidarreal.augmentation.augmented_sweep import AugmentedSweep
+from lidarreal.augmentation.rewriting.kitti_labels import KittiCamera
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarsim import LidarError
+from lidarsim.columns.sweep import Sweep
 
 P2 = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]])
 
@@ -296,6 +300,48 @@ def test_truncated_boxes(benchmark, tmp_path):
     _, truncation, occlusion, _, left, _, right, _ = line.split()[:8]
     assert 0.1 < float(truncation) < 0.9 and occlusion == "3"
     assert float(left) == 0 < float(right) < 1199
+
+
+@pytest.mark.parametrize(
+    ("center", "heading_deg"),
+    [((0.5, 2.5, -1), 0), ((1.2, -3, -1), 25), ((-0.4, 2, 0.5), -70), ((0.3, 0, -2), 130)],
+)
+def test_boxes_are_cut_at_the_camera(center, heading_deg):
+    """A camera with a wide angle sees the front parts of cars beside, above and below it."""
+    projection = np.array([[20.0, 0, 600, 0], [0, 15, 180, 0], [0, 0, 1, 0]])
+    to_camera = np.eye(4)
+    to_camera[:3] = [[0, -1, 0, 0.1], [0, 0, -1, -0.08], [1, 0, 0, -0.27]]
+    heading = np.radians(heading_deg)
+    cos, sin = np.cos(heading), np.sin(heading)
+    boxes = replace(
+        two_boxes(points=(9, 9)),
+        centers=np.array([center, [-6.0, 1, 0]]),  # the walker is behind the camera
+        quaternions=np.array([[0, 0, np.sin(heading / 2), np.cos(heading / 2)], [0, 0, 0, 1]]),
+    )
+    sweep = Sweep(np.zeros((0, 3)))
+    augmented = AugmentedSweep(sweep, np.zeros(0, int), np.zeros(0, bool), boxes)
+    (label,) = KittiCamera(to_camera, projection, (1200, 360)).labels(augmented)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    corners = signs * [2, 1, 0.75] @ turn.T + center
+    corners = corners @ to_camera[:3, :3].T + to_camera[:3, 3]
+    visible = [*corners[corners[:, 2] >= 0.1]]
+    for first, second in combinations(range(8), 2):
+        ends = corners[[first, second]]
+        ends = ends[ends[:, 2].argsort()]
+        if (signs[first] != signs[second]).sum() == 1 and ends[0, 2] < 0.1 < ends[1, 2]:
+            visible.append([np.interp(0.1, ends[:, 2], axis) for axis in ends.T])
+    assert 4 < len(visible) < 12
+    x, y, depth = np.array(visible).T
+    pixels = np.array([600 + 20 * x / depth, 180 + 15 * y / depth])
+    low, high = pixels.min(axis=1), pixels.max(axis=1)
+    seen = [low.clip(0, [1199, 359]), high.clip(0, [1199, 359])]
+    truncation = 1 - (seen[1] - seen[0]).prod() / (high - low).prod()
+    np.testing.assert_allclose(
+        np.array(label.values.split()[2:6], float), np.concatenate(seen), atol=1e-4
+    )
+    assert label.truncation == pytest.approx(truncation)
+    assert (label.kind, label.object) == ("Car", 50)
 
 
 def test_incomplete_calibrations(benchmark, tmp_path):

@@ -102,12 +102,41 @@ def test_pulses_without_a_return_stay_without_one(dense):
     assert (organized.template == np.flatnonzero(~is_lost)[augmented.template]).all()
 
 
+def shifted(sweep, azimuth_deg, elevation_deg):
+    """Return a sweep whose points have other directions at the same ranges."""
+    x, y, z = sweep.points.T
+    range_m = np.linalg.norm(sweep.points, axis=1)
+    azimuth = np.arctan2(y, x) + np.radians(azimuth_deg)
+    elevation = np.arcsin(z / range_m) + np.radians(elevation_deg)
+    level = np.cos(elevation)
+    directions = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+    return sweep.replace(points=(range_m * directions).T)
+
+
 @pytest.mark.parametrize("share", [0.2, 0.7])
-def test_random_losses_remove_the_same_pulses(dense, share):
+@pytest.mark.parametrize("azimuth_deg", [-0.2, 0, 0.2])  # of 0.5 degrees between the pulses
+def test_random_losses_remove_the_same_pulses(dense, share, azimuth_deg):
+    dense = shifted(dense, azimuth_deg, 0)
     complete = SensorResampler(recording(dense), SPARSE).sweep(0).template
     remaining = np.flatnonzero(np.random.default_rng(3).random(len(dense)) >= share)
     augmented = SensorResampler(recording(dense.select(remaining)), SPARSE).sweep(0)
     assert (remaining[augmented.template] == np.intersect1d(complete, remaining)).all()
+
+
+@pytest.mark.parametrize("elevation_deg", [-0.4, 0.4])
+def test_rings_without_a_return_are_not_replaced_by_their_neighbors(dense, elevation_deg):
+    """Other sweeps return from the ring, and from elevations at which its neighbors match, too."""
+    dense = shifted(dense, 0, elevation_deg)
+    sign = np.where(np.arange(len(dense)) % 2, 1, -1)
+    blurred = shifted(dense, 0, 0.3 * sign)
+    ring = dense.columns["channel"]
+    is_lost = np.isin(ring, [6, 7, 20])
+    sweeps = [blurred, dense, dense.select(~is_lost)]
+    resampler = SensorResampler(Recording("drive", 3, lambda number: sweeps[number]), SPARSE)
+    complete = resampler.sweep(1).template
+    assert len(complete) == 240 * 16 and is_lost[complete].sum() == 240 * 2
+    remaining = np.flatnonzero(~is_lost)[resampler.sweep(2).template]
+    assert (remaining == complete[~is_lost[complete]]).all()
 
 
 def test_noisy_directions_have_the_same_resolution(dense):

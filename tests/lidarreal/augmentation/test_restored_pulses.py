@@ -121,3 +121,13 @@ def test_compensated_sweeps_are_augmented_like_the_points_as_fired():
     late_s = result.sweep.columns["time"]
     as_fired = result.sweep.points - np.outer(SPEED_M_S * late_s, [1, 0, 0])
     np.testing.assert_allclose(as_fired, expected.sweep.points, atol=2e-3)
+
+
+@pytest.mark.parametrize("farthest", range(SWEEPS))
+def test_the_maximum_range_is_that_of_all_sweeps(farthest):
+    points = np.random.default_rng(0).uniform(1, 20, (50, 3))
+    points[7] = [-48, 0, -14]
+    sweeps = [Sweep(points[8:])] * SWEEPS
+    sweeps[farthest] = Sweep(points)
+    pattern = ScanPattern.from_recording(Recording("drive", SWEEPS, sweeps.__getitem__))
+    assert pattern.max_range_m == pytest.approx(50)

@@ -62,6 +62,19 @@ def test_counts_are_related_to_the_calibrated_reflectivity():
     )
 
 
+@pytest.mark.parametrize("white", [3e5, 3e6])
+def test_saturated_values_do_not_change_the_factor_of_a_column(white):
+    """A quarter or half of the counts have the largest value."""
+
+    def columns(energy, range_m):
+        counts = np.minimum(np.rint(white * energy), 65_535)
+        return ouster(energy, range_m) | {"signal": counts.astype(np.uint16)}
+
+    strengths = StrengthColumns.for_recording(record(columns), load_sensor("ouster/os1-64"))
+    scales = {scale.column: scale for scale in strengths.others}
+    assert scales["signal"].white == pytest.approx(white, rel=0.02)
+
+
 def test_new_returns_have_values_in_all_columns():
     strengths = StrengthColumns.for_recording(record(result))
     values = strengths.intensities(np.array([0.25, 0.1]), np.array([20.0, 10.0]))
