@@ -29,7 +29,12 @@ from lidarreal.reconstruction.reflectances import (
     incidence_factors,
 )
 from lidarreal.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
-from lidarreal.reconstruction.surface_map import Observations, SurfaceMap, median_shifts
+from lidarreal.reconstruction.surface_map import (
+    Observations,
+    SurfaceMap,
+    build_surface_map,
+    median_shifts,
+)
 from lidarreal.reconstruction.surfels import Surfels, principal_axes, surfel_mesh
 from lidarreal.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarreal.reconstruction.vehicle_returns import VehicleReturns
@@ -409,11 +414,89 @@ def test_rays_cross_several_surfels_in_order():
     np.testing.assert_allclose(first.distance_m[0, 0], 10 * length, rtol=1e-5)
 
 
-def test_surfels_shift_by_the_median_of_their_rays():
-    surfel = np.array([3, 1, 1, 1, 3, 0])
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_surfels_shift_by_the_median_of_their_rays(first):
+    """The first surfels may have no rays."""
+    surfel = np.array([3, 1, 1, 1, 3, 0]) + first
     offsets = np.array([0.4, 0.3, -0.5, 0.1, 0.2, -0.6])
-    found = median_shifts(surfel, offsets, 5)
-    np.testing.assert_allclose(found, [-0.6 / 2, 0.1 * 3 / 4, 0, 0.3 * 2 / 3, 0])
+    found = median_shifts(surfel, offsets, 5 + first)
+    expected = [0] * first + [-0.6 / 2, 0.1 * 3 / 4, 0, 0.3 * 2 / 3, 0]
+    np.testing.assert_allclose(found, expected)
+
+
+def lattice(columns, rows, voxel_m=0.1):
+    """Return one point in each voxel of an upright plane."""
+    y, z = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
+    return (np.stack([0 * y, y, z], axis=-1).reshape(-1, 3) + 0.5) * voxel_m
+
+
+@pytest.mark.parametrize(
+    ("range_m", "incidence_deg", "half_m"),
+    [
+        (25.0, 0, 0.55 * 0.25),  # reaches beyond the middle between two rings 0.25 m apart
+        (25.0, 30, 0.55 * 0.25 / np.cos(np.pi / 6)),
+        (32.0, 0, 0.55 * 0.32),
+        (90.0, 0, 0.2),  # limited by the distance of the neighbors
+    ],
+)
+def test_surfels_of_a_plane_close_the_gap_between_rings(range_m, incidence_deg, half_m):
+    points = lattice(20, 20)
+    incidence = np.radians(incidence_deg)
+    outward = np.tile(range_m * np.array([np.cos(incidence), np.sin(incidence), 0]), (400, 1))
+    surfels = Surfels.from_points("plane", points, outward, 0.1, 0.01)
+    inner = (np.abs(surfels.centers[:, 1:] - 1) < 0.7).all(axis=1)
+    assert inner.sum() > 100
+    np.testing.assert_allclose(surfels.normals @ [1.0, 0, 0], 1, atol=1e-6)
+    across_m = np.linalg.norm(surfels.half_sides[1], axis=1)
+    np.testing.assert_allclose(across_m[inner], half_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("range_m", "is_pole"), [(5.0, True), (20.0, True), (50.0, False)])
+@pytest.mark.parametrize("is_upright", [True, False])
+def test_lines_across_several_rings_are_poles_that_face_the_sensor(range_m, is_pole, is_upright):
+    """At 50 m, neighbors on the line extend over one ring. Horizontal lines belong to one ring."""
+    points = lattice(1, 100) if is_upright else lattice(100, 1)
+    outward = np.tile([0.6 * range_m, -0.8 * range_m, 0], (100, 1))
+    surfels = Surfels.from_points("pole", points, outward, 0.1, 0.01)
+    half_m = np.linalg.norm(surfels.half_sides[1], axis=1)
+    is_thin = np.isclose(half_m, 0.05)  # half a voxel
+    assert (is_thin == (is_pole and is_upright)).all()
+    np.testing.assert_allclose(surfels.normals[is_thin] @ [0.6, -0.8, 0], 1)
+
+
+def test_surfels_of_lost_pulses_face_the_sensor():
+    """A wall with a window that returns no pulses, seen from two positions."""
+    turns = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 161), np.linspace(-0.2, 0.2, 81)), axis=-1)
+    tangents = np.tan(turns.reshape(-1, 2))
+    directions = np.column_stack([np.ones(len(tangents)), tangents])
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+
+    def observed(number):
+        origin = np.array([0.0, number - 0.5, 1.0])
+        range_m = 10 / directions[:, 0]
+        ends = origin + directions * range_m[:, None]
+        is_lost = (np.abs(ends[:, 1:] - [0.5, 1]) < [1.5, 1]).all(axis=1)
+        sweeps = []
+        for rows, world in ((~is_lost, ends), (is_lost, origin + directions)):
+            origins = np.tile(origin, (rows.sum(), 1))
+            ring = np.zeros(rows.sum(), int)
+            sweeps.append(AlignedSweep(world[rows], world[rows], origins, ring, None, None))
+        return sweeps[0], sweeps[1]._replace(gap_range_m=range_m[is_lost])
+
+    sweeps = SimpleNamespace(
+        name="wall",
+        recorded=SimpleNamespace(gap_rad=0.005),
+        read=lambda number: observed(number)[0],
+        read_with_lost=observed,
+    )
+    stationary = {number: np.ones(len(observed(number)[0].world), bool) for number in (0, 1)}
+    surfels = build_surface_map(sweeps, stationary, 0.15).surfels
+    dark = surfels.dark
+    assert dark.sum() > 100 and (~dark).sum() > 500
+    np.testing.assert_allclose(surfels.centers[:, 0], 10, atol=1e-6)
+    np.testing.assert_allclose(surfels.normals @ [-1.0, 0, 0], 1, atol=1e-6)
+    in_window = (np.abs(surfels.centers[:, 1:] - [0.5, 1]) < [1.5, 1]).all(axis=1)
+    assert (in_window == dark).mean() > 0.95
 
 
 def test_surfels_of_a_tilted_plane_lie_in_it_and_face_the_sensor():
