@@ -269,9 +269,14 @@ def spans_of(folder: Path) -> list[Span]:
 
 
 def shares_of(spans: Iterable[Span], start: float, end: float) -> dict[str, float]:
-    """Return the fraction of the slot time between two times that each client used."""
+    """Return the fraction of the slot time between two times in the quiet phase, by client.
+
+    Canceled tasks that still run are not counted, because clients are not charged for them.
+    """
     used: defaultdict[str, float] = defaultdict(float)
     for span in spans:
+        if QUIET not in span.item:
+            continue
         used[span.item.partition("-")[0]] += max(0.0, min(end, span.end) - max(start, span.start))
     total = sum(used.values())
     return {client: seconds / total for client, seconds in used.items()}

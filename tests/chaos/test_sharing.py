@@ -32,11 +32,12 @@ def test_each_defect_is_found(tmp_path):
     assert judge(tmp_path, set()).other == ["alice: PoolError\n"]
 
 
-def test_shares_only_include_the_time_in_the_window():
+def test_shares_only_include_tasks_of_the_quiet_phase_and_the_time_in_the_window():
     spans = [
-        Span("alice-1-0", 0.0, 3.0, "x"),
-        Span("bob-1-0", 2.0, 9.0, "y"),
-        Span("bob-1-1", 9, 10, "y"),
+        Span("alice-quiet1-0", 0.0, 3.0, "x"),
+        Span("bob-quiet1-0", 2.0, 9.0, "y"),
+        Span("bob-quiet1-1", 9, 10, "y"),
+        Span("bob-1-1", 0, 10, "z"),  # was canceled
     ]
     assert shares_of(spans, 1.0, 4.0) == {"alice": 0.5, "bob": 0.5}
 
