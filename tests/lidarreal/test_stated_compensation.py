@@ -268,3 +268,32 @@ def test_points_as_fired_without_times_are_noted():
     assert note.startswith("drive contains points as fired, but not the times of its points")
     still = PosedSweeps(Recording("drive", 1, read, compensated=False))
     assert still.read(0).firing_poses is None and not still.notes
+
+
+@pytest.mark.parametrize("name", ["ply", "las", "parquet"])
+def test_points_as_fired_are_converted_to_world_coordinates(name, tmp_path):
+    spec = ExportSpec(name)
+    spec.check_installed()
+    ExportSpec("mcap").check_installed()
+    save_cloud(drive("sensor"), tmp_path / "drive.mcap")
+    recording = open_recording(tmp_path / "drive.mcap", keep_noise=True)
+    converter = open_converter(tmp_path / "drive.mcap", recording, spec)
+    target = tmp_path / f"new{converter.ending}"
+    notes = rewrite(converter, target, tmp_path / "work", identity)
+    assert not any("as fired" in note for note in notes)
+    truth = drive()
+    converted = open_recording(target)
+    parts = [converted[number] for number in range(len(converted))]
+    points = np.concatenate(
+        [part.points if converted.is_cloud else part.in_world() for part in parts]
+    )
+    assert len(points) == len(truth)
+    assert cKDTree(truth.positions).query(points)[0].max() < 3 * TOLERANCE_M
+
+
+def test_conversions_note_points_as_fired_without_times_of_sweeps(tmp_path):
+    save_cloud(drive("sensor"), tmp_path / "drive", format="pcd")
+    recording = open_recording(tmp_path / "drive", keep_noise=True)
+    converter = open_converter(tmp_path / "drive", recording, ExportSpec("ply"))
+    notes = rewrite(converter, tmp_path / "new.ply", tmp_path / "work", identity)
+    assert any("as fired, but not the times of its sweeps. All points" in note for note in notes)

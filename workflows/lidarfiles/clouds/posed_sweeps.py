@@ -58,16 +58,31 @@ class PosedSweeps:
         self._poses[number] = sweep.pose
         if sweep.compensated is not False or sweep.firing_poses is not None or sweep.pose is None:
             return sweep
-        return sweep.replace(firing_poses=self._firing_poses(sweep, number))
+        return sweep.replace(firing_poses=self.firing_poses(number, sweep.pose, sweep.times_s))
 
-    def _firing_poses(self, sweep: Sweep, number: int) -> FiringPoses | None:
-        """Interpolate the firing poses of a sweep, or add a note and return None."""
-        times_s = sweep.times_s
+    def firing_poses(self, number: int, pose: Floats, times_s: Floats | None) -> FiringPoses | None:
+        """Interpolate the poses at the firings of a sweep between the poses of the sweeps.
+
+        Parameters
+        ----------
+        number
+            Number of the sweep.
+        pose
+            Pose of the sweep, of shape (4, 4).
+        times_s
+            Firing times in seconds relative to the timestamp of the sweep, of shape (n,), or None
+            if they are unknown.
+
+        Returns
+        -------
+        The poses, or None if they are unknown. In the latter case, a note is added if the sensor
+        moves.
+        """
         stamps_ns = self.recording.stamps_ns
         path = None
         if times_s is not None and stamps_ns is not None:
             path = path_of_sweep(self._pose, stamps_ns[: len(self.recording)], number)
-        if path is None or times_s is None or sweep.pose is None:
+        if path is None or times_s is None:
             if np.any(self._pose(0) != self._pose(len(self.recording) - 1)):
                 missing = "its points" if times_s is None else "its sweeps"
                 note = (
@@ -77,7 +92,7 @@ class PosedSweeps:
                 self.notes.extend([note] if note not in self.notes else [])
             return None
         positions, rotations = poses_at(path, times_s)
-        position, rotation = sweep.pose[:3, 3], sweep.pose[:3, :3]
+        position, rotation = pose[:3, 3], pose[:3, :3]
         quaternions = quaternions_of(rotation.T @ rotations)
         return FiringPoses(position, rotation, (positions - position).T, quaternions.T)
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording import Recording, RecordingSource
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.parts.parts import StoredCloud, pack
@@ -149,6 +150,21 @@ class FormatConverter(Rewriter):
     def _pose(self, number: int, sweep: Sweep) -> Floats | None:
         return sweep.pose if self._poses is None else self._poses[number]
 
+    @cached_property
+    def _posed(self) -> PosedSweeps:
+        return PosedSweeps(self.recording)
+
+    def _positions(
+        self, sweep: Sweep, points: Floats, pose: Floats | None, times_s: Floats | None
+    ) -> Floats:
+        """Transform the returns of a sweep to the coordinates that the format stores."""
+        if pose is None or self._in_sensor:
+            return points
+        firing_poses = None
+        if sweep.compensated is False:
+            firing_poses = self._posed.firing_poses(sweep.number, pose, times_s)
+        return Sweep(points, pose=pose, firing_poses=firing_poses).in_world()
+
     def encode(
         self, number: int, augmented: AugmentedSweep
     ) -> tuple[dict[str, bytes], dict[str, Any]]:
@@ -158,17 +174,15 @@ class FormatConverter(Rewriter):
         mask = sweep.has_return
         points = np.asarray(sweep.points, np.float64)[mask]
         pose = self._pose(number, sweep)
-        positions = points
-        if pose is not None and not self._in_sensor:
-            positions = points @ pose[:3, :3].T + pose[:3, 3]
+        all_times_s = self.recording.times_of(sweep)
+        times_s = None if all_times_s is None else all_times_s[mask]
+        positions = self._positions(sweep, points, pose, times_s)
         cells = np.rint((positions - self._origin) / self._precision_m)
         if np.abs(cells).max(initial=0) >= 1 << 31:
             raise LidarError(
                 f"Sweep {number} contains points that are too far from the first sweep or from the "
                 "sensor. Remove these points from the recording."
             )
-        all_times_s = self.recording.times_of(sweep)
-        times_s = None if all_times_s is None else all_times_s[mask]
         values = self._known_columns(augmented, mask, points, times_s)
         columns = {axis.name: cells[:, index].astype(axis.dtype) for index, axis in enumerate(AXES)}
         for column in columns_in_parts(self._optional)[len(AXES) :]:
@@ -196,6 +210,7 @@ class FormatConverter(Rewriter):
             "object_names": list(sweep.object_names),
             "boxes": box_details(augmented),
             "full_scale": self._intensity_scale.full_scale,
+            "notes": self._posed.notes,
         }
         return {_part_file(number): b"".join(pack(part))}, details
 
@@ -287,6 +302,8 @@ class FormatConverter(Rewriter):
             if name in summary.recorded and name not in _STRENGTHS
         ]
         notes = self._notes(summary, needed)
+        placed = (note for details in encoded.details() for note in details["notes"])
+        notes += [f"{note}." for note in dict.fromkeys(placed)]
         empty = spec.describe_empty_fields(cloud, sweeps, source=self.source.name)
         notes += [f"{spec.title} {text}." for text in empty]
         if unsupported:
