@@ -132,6 +132,24 @@ def test_idle_partitions_exchange_no_workers():
     assert policy.demands["B"].slots == pytest.approx(12 / 0.5 * 0.2, rel=0.2)
 
 
+@pytest.mark.parametrize(
+    ("task_s", "shifts"), [(0.01, [WorkerShift("A", "B", 1)]), (1.0, [])], ids=["many", "few"]
+)
+def test_a_small_gain_must_be_known_from_many_tasks(task_s, shifts):
+    policy = BalancePolicy()
+    for tick in range(60):
+        samples = {
+            name: LoadSample(
+                10, finished=round(slots * 0.5 * tick / task_s), seconds=slots * 0.5 * tick
+            )
+            for name, slots in {"A": 9.0, "B": 10.5}.items()
+        }
+        found = policy.update(samples, 0.5)
+        if found:
+            break
+    assert found == shifts
+
+
 @pytest.mark.parametrize("decode", [3, 63, 110])
 @pytest.mark.parametrize("capacity", [10, 126, 5000])
 def test_a_pipeline_reaches_its_ideal_throughput(decode, capacity):
