@@ -525,6 +525,22 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
     assert "only one in every 5 hits" in repr(compare(tmp_path, folder))
 
 
+@pytest.mark.parametrize(("late_s", "number"), [(-0.04, 0), (0.16, 2), (0.24, 2)])
+def test_a_single_sweep_is_matched_by_time(written, late_s, number):
+    """Sweeps are expected to be 0.1 s apart, so they match if they are less than 0.05 s apart."""
+    folder, made, sweeps = written
+    survey = replace(SURVEY, poses=[SURVEY.poses[number]], trajectory=None)
+    single = Sweeps.from_survey(survey, Scene.seed())
+    single = replace(single, begins_ns=sweeps.begins_ns[:1] + 1e9 * late_s)
+    rows = made["scan"] // 36 == number
+    columns = {name: values[rows] for name, values in made.columns.items()}
+    columns["scan"] = columns["scan"] - 36 * number
+    one = Cloud(made.positions[rows], columns, sweeps=lambda: single)
+    found = compare(folder, one, match="time").figures
+    assert found["pairs"] == 1
+    assert found["distances"]["a_to_b"]["max_m"] < 2e-3
+
+
 @pytest.mark.extended(keep=("ray-True",))
 @pytest.mark.parametrize("scans_in_rings", [True, False])
 @pytest.mark.parametrize("told", ["time", "ray", "neither"])

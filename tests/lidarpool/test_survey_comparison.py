@@ -16,11 +16,15 @@ from click.testing import CliRunner
 from rasterio.crs import CRS
 
 from lidarfiles import open_recording
+from lidarfiles.clouds.recording import Recording
 from lidarpool.cli.commands import cli
 from lidarreal import compare, compare_strips, compare_surveys
 from lidarreal.comparing.surveys import pairs, planes
+from lidarreal.comparing.surveys.orientation import OrientedPoints
 from lidarreal.comparing.surveys.survey_charts import draw_facades
+from lidarreal.comparing.surveys.survey_clouds import SurveyCloud
 from lidarsim import Cloud, LidarError, Scene, Sensor, Survey, Track
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
 ORIGIN = np.array([500_000.0, 5_800_000.0, 100.0])
@@ -115,6 +119,28 @@ def test_clouds_without_common_times_are_not_paired():
         compare_surveys(a, b, method="pairs")
     with pytest.raises(LidarError, match="no column `time` or `gps_time` in common"):
         compare_surveys(cloud(points), b, method="pairs")
+
+
+@pytest.mark.parametrize("sizes", [(1000, 3000), (3000, 1000)])
+@pytest.mark.parametrize("ambiguous", [0, 500])
+@pytest.mark.parametrize("is_paired", [True, False])
+def test_one_percent_of_the_smaller_cloud_must_be_paired(sizes, ambiguous, is_paired):
+    """Points with the same time as another point belong to the cloud, but have no pair."""
+    common = (1000 + ambiguous) // 100 - (not is_paired)
+    clouds = []
+    for number, size in enumerate(sizes):
+        times = np.arange(size) + 10_000 * number
+        times[:common] = np.arange(common) + 50_000
+        times = np.append(times, np.full(ambiguous, 90_000 + number))
+        points = plane(len(times), seed=1)
+        clouds.append(cloud(points - number * np.array(SHIFT), time=times))
+    if is_paired:
+        found = compare_surveys(*clouds, method="pairs")
+        assert components(found, "delta_h")["count"] == common
+        assert found.figures["ambiguous"] == {"a": ambiguous, "b": ambiguous}
+    else:
+        with pytest.raises(LidarError, match="hardly any points of cloud A and cloud B have the"):
+            compare_surveys(*clouds, method="pairs")
 
 
 TIMES = {
@@ -389,6 +415,41 @@ def test_both_sides_of_a_thin_wall_face_their_stations(tmp_path):
     assert np.allclose(distances[east], 0.03, atol=1e-4)
     assert np.allclose(distances[~east], -0.02, atol=1e-4)
     assert 0.4 < east.mean() < 0.6
+
+
+@pytest.mark.parametrize("known", [1.0, 0.1])
+def test_normals_face_the_scanner_of_their_surface(known):
+    """Two walls between which a scanner stands, and one behind it that another scanner sees.
+
+    The signs of the normals are random, and the points of the walls are mixed.
+    """
+    rng = np.random.default_rng(8)
+    walls = [(-4.0, (1, 2, 0)), (5.0, (1, 2, 0)), (12.0, (20, 0, 0))]
+    points = np.concatenate(
+        [sheet((0, 9, 0), (0, 0, 3), 600, seed=3) + np.array([x, 0, 0]) for x, _ in walls]
+    )
+    scanners = np.repeat(np.array([scanner for _, scanner in walls], float), 600, axis=0)
+    expected = np.sign(scanners[:, :1] - points[:, :1]) * [1.0, 0, 0]
+    normals = expected * rng.choice([-1, 1], (1800, 1))
+    scanners[rng.random(1800) >= known] = np.nan
+    order = rng.permutation(1800)[:-9]
+    kept, others = order[9:], order[:9]
+    oriented = OrientedPoints.from_normals(points[kept], normals[kept], scanners[kept], 0.3)
+    assert np.array_equal(oriented.normals, expected[kept])
+    for there in (scanners[others], np.full((9, 3), np.nan), None):
+        assert np.array_equal(
+            oriented.orient(points[others], normals[others], there), expected[others]
+        )
+
+
+@pytest.mark.parametrize("counts", [(1000,) * 8, (300, 5000, 20, 1500, 1180)])
+def test_a_sample_is_even_if_the_number_of_points_is_unknown(counts):
+    parts = [Sweep(np.full((count, 3), number + 1.0)) for number, count in enumerate(counts)]
+    recording = Recording("scans", len(counts), parts.__getitem__, is_cloud=True)
+    points, notes = SurveyCloud("scans", (recording,), None).sample(2000)
+    found = np.bincount(points.positions[:, 0].astype(int) - 1)
+    np.testing.assert_allclose(found, np.array(counts) / 4, atol=3)
+    assert notes == ["25 % of the points in scans are used, sampled evenly"]
 
 
 def swept(points, scans, poses):

@@ -18,11 +18,13 @@ from lidarreal.reconstruction.lost_pulses import SensorCoverage, firings_per_tur
 from lidarreal.reconstruction.motion import Motion
 from lidarreal.reconstruction.moving_rays import TimedPulses, collect_moving_rays
 from lidarreal.reconstruction.object_tracks import ObjectTrack
-from lidarreal.reconstruction.recorded_sensor import SweepTiming
+from lidarreal.reconstruction.recorded_sensor import SweepTiming, fit_sensor
 from lidarreal.reconstruction.recorded_sweeps import RecordedSweeps, ring_starts
 from lidarreal.reconstruction.reflectances import IntensityModel, Response
 from lidarreal.scan_patterns.lasers import RingLasers
+from lidarsim import LidarError
 from lidarsim.columns.sweep import Sweep
+from lidarsim.sensor.models import Detection, Performance
 
 pytest.importorskip("scipy")
 
@@ -253,9 +255,15 @@ def test_rays_are_collected_near_what_moves_before_it_starts_and_after_it_stops(
     assert not len(collect_moving_rays(sweeps, still, [1], [gone]).sweep)
 
 
-def test_snow_is_in_the_air_and_a_thin_pole_is_not():
-    """Flakes are elsewhere in each sweep. A pole also returns single pulses, always the same."""
+def test_snow_is_in_the_air_and_thin_poles_are_not():
+    """Flakes are elsewhere in each sweep. Poles also return single pulses, always the same.
+
+    A pulse that hits the first pole also returns from a pole behind it.
+    """
     vectors, ring, share = directions(clockwise=False)
+    is_behind = np.arange(len(ring) + RINGS) >= len(ring)
+    rows = np.append(np.arange(len(ring)), np.flatnonzero(np.abs(share - 0.3) < 0.4 / COLUMNS))
+    vectors, ring, share = vectors[rows], ring[rows], share[rows]
     hall_m = 12 / np.hypot(vectors[:, 0], vectors[:, 1])
     is_pole = np.abs(share - 0.3) < 0.4 / COLUMNS
     flakes = []
@@ -264,6 +272,7 @@ def test_snow_is_in_the_air_and_a_thin_pole_is_not():
         chosen = rng.choice(np.flatnonzero(~is_pole), 400, replace=False)
         range_m = hall_m.copy()
         range_m[is_pole] = 3.0
+        range_m[is_behind] = 3.7
         range_m[chosen] = rng.uniform(0.6, 4.0, 400)
         mask = np.zeros(len(ring), bool)
         mask[chosen] = True
@@ -337,3 +346,45 @@ def test_a_sensor_is_fitted_to_channels_from_the_lowest_ring_to_the_highest(monk
             np.testing.assert_array_equal(one.firing_poses, np.eye(3) - 3)
     unknown, options = recorded_sensor._fit_to_sweeps(sweeps, np.array([2]), None, None)
     assert options["white"] is None and unknown[0].intensity.tolist() == [30, 60, 15]
+
+
+@pytest.mark.parametrize("range_m", [None, 0.0123456])
+@pytest.mark.parametrize("is_fitted", [True, False])
+def test_the_noise_of_a_sensor_is_fitted_but_not_its_detection(monkeypatch, range_m, is_fitted):
+    """The map already lacks what the sensor did not detect. Ring errors are those of the map."""
+    sweeps = aligned(recorded(), PERIOD_S * np.arange(5), Motion.TIMED)
+    sensor = SweepTiming.from_sweeps(sweeps).sensor(sweeps, 2, None)
+    biases_m = [0.01 * k for k in range(RINGS)]
+    sensor = sensor.model_copy(
+        update={"performance": Performance(channel_bias_m=biases_m, angle_deg=0.07)}
+    )
+    fitted = Performance(
+        range_m=0.05,
+        range_per_m=1e-3,
+        angle_deg=0.02,
+        detection=Detection(range_m=50, probability=0.5),
+        false_alarms=1e-3,
+        dropout=0.1,
+        mode="last",
+    )
+
+    def fit(*_, **__):
+        if not is_fitted:
+            raise LidarError("There are too few rays.")
+        return SimpleNamespace(model=SimpleNamespace(performance=fitted))
+
+    noise = None if range_m is None else SimpleNamespace(range_m=range_m)
+    monkeypatch.setattr(recorded_sensor, "fit", fit)
+    monkeypatch.setattr(recorded_sensor, "estimate_range_noise", lambda *_: noise)
+    sizes = dict.fromkeys(range(5), RINGS * COLUMNS)
+    found = fit_sensor(sweeps, sizes, None, None, sensor)
+    kept = {"angle_deg": 0.02, "mode": "last"} if is_fitted else {"angle_deg": 0.07}
+    if range_m is not None:
+        kept["range_m"] = 0.01235
+    elif is_fitted:
+        kept |= {"range_m": 0.05, "range_per_m": 1e-3}
+    expected = {"channel_bias_m": tuple(biases_m), **kept}
+    assert found.model.performance.model_dump(exclude_defaults=True) == expected
+    assert found.model.beams == sensor.beams and found.range_noise is noise
+    assert found.model.sources["performance"].endswith(" to hall, 5 sweeps")
+    assert bool(found.notes) != is_fitted

@@ -9,6 +9,7 @@ import pytest
 
 from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.resampling import SensorResampler
+from lidarreal.augmentation.ring_directions import RingDirections
 from lidarsim import LidarError, Sensor, load_sensor
 from lidarsim.columns.sweep import Sweep
 
@@ -181,6 +182,19 @@ def test_tilted_rings_are_measured(dense):
     up_deg, across_deg = angles_deg(augmented.sweep.points, channel, narrow)
     assert up_deg.max() < 0.6 and across_deg.max() < 0.3
     assert len(np.unique(tilted.columns["channel"][augmented.template[channel == 4]])) > 7
+
+
+def test_elevations_of_tilted_rings_depend_on_the_azimuth(dense):
+    tilted = dense.replace(points=dense.points @ TILT.T)
+    pulses = RingDirections(recording(tilted))
+    x, y, z = tilted.points[::97].T
+    azimuth = np.arctan2(y, x)
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    found = np.degrees(pulses.elevations_at(azimuth))
+    ring = DENSE.channels - 1 - dense.columns["channel"][::97].astype(int)
+    assert np.ptp(found[:, 15]) > 7  # a tilt by 4 degrees
+    np.testing.assert_allclose(found[np.arange(len(ring)), ring], elevation, atol=0.2)
+    assert np.degrees(pulses.spread_rad) < 0.2
 
 
 def test_compensated_results_use_the_directions_as_fired(dense):
