@@ -141,6 +141,21 @@ def test_a_car_that_stops_stays_where_it_stops():
     assert reverse.stands_before and not reverse.stands_after
 
 
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_car_that_stops_behind_another_is_followed(is_reversed):
+    """A third of its points is visible from shortly before it stops, or until it has started."""
+
+    def path(times_s):
+        return braking(2.0 - times_s) if is_reversed else braking(times_s - 1.0)
+
+    rays = rays_of([path], 30)
+    hidden = (rays.sweep < 13) if is_reversed else (rays.sweep >= 17)
+    kept = ~hidden | (np.random.default_rng(3).random(len(rays.sweep)) < 0.33)
+    (track,) = find_tracks(rays.select(kept), None, PERIOD_S)
+    assert track.stands_before == is_reversed and track.stands_after != is_reversed
+    assert track.times_s[0] < 0.2 and track.times_s[-1] > 2.8
+
+
 @pytest.mark.extended
 def test_cars_that_meet_are_two_objects_of_their_own_shape():
     def near(times_s):

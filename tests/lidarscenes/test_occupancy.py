@@ -129,6 +129,27 @@ def test_voxels_with_centers_in_closed_meshes_are_occupied():
     assert not found.occupied[middle]  # the mesh is open
 
 
+def test_voxel_centers_in_tetrahedra_are_found():
+    """The tetrahedra extend beyond the grid. Voxels in the first keep its number."""
+    random = np.random.default_rng(3)
+    shape = (7, 6, 8)
+    centers = np.stack(np.meshgrid(*(np.arange(count) + 0.5 for count in shape), indexing="ij"), -1)
+    for orientation in (1, -1) * 10:
+        found = np.full(shape, -1, np.int32)
+        expected = found.copy()
+        for number in (4, 2):
+            corners = random.uniform(-3, 11, (4, 3))
+            shares = np.linalg.solve(
+                (corners[1:] - corners[0]).T, (centers - corners[0])[..., None]
+            )
+            inside = (shares > 0).all(axis=(-2, -1)) & (shares.sum(axis=(-2, -1)) < 1)
+            expected[inside & (expected < 0)] = number
+            faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])[:, ::orientation]
+            loops.add_interior(np.ascontiguousarray(corners[faces]), number, found)
+        np.testing.assert_array_equal(found, expected)
+        assert {2, 4} & {*found.ravel().tolist()}
+
+
 def test_surfaces_intersect_the_same_voxels_as_clipped_triangles():
     random = np.random.default_rng(4)
     corners = random.uniform(-1, 7, (40, 3, 3))

@@ -387,6 +387,20 @@ def test_factors_at_close_range_are_those_of_the_intervals():
     assert near(drop, height_m=(-1.8, -1.8)).factors == pytest.approx((*drop, 1.0))
 
 
+@pytest.mark.parametrize("heights_m", [(-1.4, -0.6), (-3.0, -2.2)])
+def test_dark_surfaces_above_or_below_the_ground_are_no_drop(heights_m):
+    """Most returns at close range come from a dark vehicle or ditch, and 250 from the ground."""
+    random = np.random.default_rng(1)
+    edges = [1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0]
+    ground_m = [random.uniform(*ends, 250) for ends in pairwise(edges)]
+    ground_m = np.concatenate([*ground_m, random.uniform(10, 15, 10_000)])
+    dark_m = np.linspace(1, 3, 10_000)
+    range_m = np.concatenate([ground_m, dark_m])
+    height_m = np.append(np.full(len(ground_m), -1.8), random.uniform(*heights_m, len(dark_m)))
+    levels = np.where(np.arange(len(range_m)) < len(ground_m), 0.3, 0.05)
+    assert NearFactors.from_returns(levels, returns_at(range_m, height_m)) == NearFactors()
+
+
 # -- recorded values -------------------------------------------------------------------------
 
 
