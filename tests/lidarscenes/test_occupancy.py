@@ -134,6 +134,7 @@ def test_voxel_centers_in_tetrahedra_are_found():
     random = np.random.default_rng(3)
     shape = (7, 6, 8)
     centers = np.stack(np.meshgrid(*(np.arange(count) + 0.5 for count in shape), indexing="ij"), -1)
+    counts = np.zeros(2, np.int64)
     for orientation in (1, -1) * 10:
         found = np.full(shape, -1, np.int32)
         expected = found.copy()
@@ -147,7 +148,8 @@ def test_voxel_centers_in_tetrahedra_are_found():
             faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])[:, ::orientation]
             loops.add_interior(np.ascontiguousarray(corners[faces]), number, found)
         np.testing.assert_array_equal(found, expected)
-        assert {2, 4} & {*found.ravel().tolist()}
+        counts += (found == 4).sum(), (found == 2).sum()
+    assert counts.min() > 200
 
 
 def test_surfaces_intersect_the_same_voxels_as_clipped_triangles():
