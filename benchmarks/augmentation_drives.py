@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.recording import Recording
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, with_sweeps
 from lidarpool import (
     Actor,
     Cloud,
@@ -144,7 +144,7 @@ class Drive:
 
     def recording(self, condition: Condition = CLEAR, seed: int = 0) -> Recording:
         """Simulate the drive, and open it as a recording."""
-        return open_recording(self.cloud(condition, seed))
+        return with_sweeps(open_recording(self.cloud(condition, seed)))
 
 
 def ranges(sweep: Sweep) -> Floats:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import ks_2samp
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording, RecordingInfo
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import Sensor, load_sensor
 from lidarreal.augmentation.augmenter import Augmenter
@@ -39,21 +39,26 @@ SKY_SECTORS = 6  # sectors in which the top rings return least
 BINS_M = (2, 4, 6, 8, 10, 15, 20, 30, 50, 100)
 
 
-def open_csv_folder(folder: Path) -> Recording:
-    """Open sweeps that are stored as CSV files with the columns x, y, z, intensity and ring."""
-    files = sorted(folder.glob("*.csv"))
+class CSVRecording(Recording):
+    """Sweeps that are stored as CSV files with the columns x, y, z, intensity and ring."""
 
-    def read(number: int) -> Sweep:
-        table = np.loadtxt(files[number], delimiter=",")
+    def __init__(self, folder: Path) -> None:
+        super().__init__(RecordingInfo(folder.name))
+        self._files = sorted(folder.glob("*.csv"))
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def load(self, number: int) -> Sweep:
+        """Read a file."""
+        table = np.loadtxt(self._files[number], delimiter=",")
         columns = {"intensity": table[:, 3].astype(np.float32), "channel": table[:, 4].astype(int)}
         return Sweep(table[:, :3], columns)
-
-    return Recording(folder.name, len(files), read)
 
 
 def compare_fog(foggy: Path, clear: Path) -> dict[str, Any]:
     """Print and return properties of foggy sweeps and of clear sweeps with added fog."""
-    recorded = open_csv_folder(foggy)
+    recorded = CSVRecording(foggy)
     model = load_sensor(MODEL)
     pattern = ScanPattern.from_recording(recorded, model)
     sweeps = [recorded[number] for number in _numbers(recorded)]

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording, RecordingInfo, SweepsInMemory
 from lidarpool import LidarError, Noise, Scanner, Scene, Sensor
 from lidarreal.comparing.fit.fitting import fit
 from lidarscenes.procedural.city import city
@@ -144,7 +144,8 @@ def recorded(
         columns = {"channel": channel, "intensity": arrays[f"intensity{number}"]}
         return Sweep(points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], columns)
 
-    return Recording("simulated", sweeps, read, energy_unit=1.0)
+    info = RecordingInfo("simulated", energy_unit=1.0)
+    return SweepsInMemory(info, [read(number) for number in range(sweeps)])
 
 
 def trial(

@@ -106,7 +106,7 @@ def simulate_period(model: str, columns: int) -> list[Sweep]:
     recording = open_recording(
         simulated_drive(scene.with_actors(actors), survey), None, None, name="period"
     )
-    return [recording.read(number) for number in range(_PERIOD_SWEEPS)]
+    return [recording.load(number) for number in range(_PERIOD_SWEEPS)]
 
 
 def write_drive(folder: Path, sweeps: Sequence[Sweep], period_count: int) -> Path:

@@ -34,8 +34,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from lidarfiles.clouds.recording import Recording
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.clouds.recording import Recording, RecordingInfo, RecordingSection
+from lidarfiles.recordings.opening import open_recording, with_sweeps
 from lidarreal.reconstruction.alignment import AlignedSweeps, first_alignment
 from lidarreal.reconstruction.building import DEFAULT_VOXEL_M
 from lidarreal.reconstruction.free_space import find_stationary_points
@@ -51,7 +51,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
-from .augmentation_fog import open_csv_folder
+from .augmentation_fog import CSVRecording
 from .harness import argument_parser, write_results
 
 _COMPARED_SWEEPS = 24
@@ -73,37 +73,43 @@ class Source(NamedTuple):
 
 
 def _opened(folder: str) -> Callable[[Path], Recording]:
-    return lambda root: open_recording(root / folder, None, None, name=root.name)
+    return lambda root: with_sweeps(open_recording(root / folder))
 
 
-def _tram(root: Path) -> Recording:
-    """Open range images.
+class _Tram(Recording):
+    """Range images.
 
     These are 16-bit PNG files with a row for each ring, in which 0 means no return.
     """
-    files = sorted((root / _TRAM / "data").glob("*.png"))
-    entries = (root / _TRAM / "velodyne_config.txt").read_text().splitlines()[-1].split()
-    steps_per_m, column_count, ring_count, start_deg, stop_deg = map(float, entries[:5])
-    elevation = -np.radians(np.array(entries[5:], np.float64))
-    assert len(elevation) == ring_count
-    columns = np.arange(int(column_count))
-    azimuth = np.radians(start_deg + (columns + 0.5) * (stop_deg - start_deg) / column_count)
-    level = np.cos(elevation)[:, None]
-    directions = np.stack(
-        [
-            level * np.cos(azimuth),
-            level * np.sin(azimuth),
-            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
-        ],
-        axis=2,
-    )
-    ring = np.arange(len(elevation)).repeat(len(azimuth))
 
-    def read(number: int) -> Sweep:
-        range_m = np.asarray(Image.open(files[number]), np.float64) / steps_per_m
-        return Sweep((range_m[..., None] * directions).reshape(-1, 3), {"ring": ring})
+    def __init__(self, root: Path) -> None:
+        super().__init__(RecordingInfo("tram"))
+        self._files = sorted((root / _TRAM / "data").glob("*.png"))
+        entries = (root / _TRAM / "velodyne_config.txt").read_text().splitlines()[-1].split()
+        steps_per_m, column_count, ring_count, start_deg, stop_deg = map(float, entries[:5])
+        elevation = -np.radians(np.array(entries[5:], np.float64))
+        assert len(elevation) == ring_count
+        columns = np.arange(int(column_count))
+        azimuth = np.radians(start_deg + (columns + 0.5) * (stop_deg - start_deg) / column_count)
+        level = np.cos(elevation)[:, None]
+        self._steps_per_m = steps_per_m
+        self._directions = np.stack(
+            [
+                level * np.cos(azimuth),
+                level * np.sin(azimuth),
+                np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
+            ],
+            axis=2,
+        )
+        self._ring = np.arange(len(elevation)).repeat(len(azimuth))
 
-    return Recording("tram", len(files), read)
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def load(self, number: int) -> Sweep:
+        range_m = np.asarray(Image.open(self._files[number]), np.float64) / self._steps_per_m
+        points = (range_m[..., None] * self._directions).reshape(-1, 3)
+        return Sweep(points, {"ring": self._ring})
 
 
 SOURCES = {
@@ -113,7 +119,7 @@ SOURCES = {
         {"drive": slice(None)},
     ),
     "tram": Source(
-        "FranksVelodyneAlgos", _tram, {"standing": slice(0, 100), "driving": slice(-160, None)}
+        "FranksVelodyneAlgos", _Tram, {"standing": slice(0, 100), "driving": slice(-160, None)}
     ),
     "kitti360": Source(
         "Pointcloud-Segmentation",
@@ -133,7 +139,7 @@ SOURCES = {
     ),
     "foggy": Source(
         "radiate_sdk",
-        lambda root: open_csv_folder(root / "data/radiate/tiny_foggy/velo_lidar"),
+        lambda root: CSVRecording(root / "data/radiate/tiny_foggy/velo_lidar"),
         {"drive": slice(None)},
     ),
 }
@@ -141,10 +147,8 @@ SOURCES = {
 
 def part_of(recording: Recording, chosen: slice) -> Recording:
     """Return the given consecutive sweeps of a recording."""
-    numbers = range(recording.count)[chosen]
-    return replace(
-        recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
-    )
+    numbers = range(len(recording))[chosen]
+    return RecordingSection(recording, numbers.start, len(numbers))
 
 
 def mapped_sweeps(count: int, rule: str) -> Ints:

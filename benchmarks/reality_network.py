@@ -184,7 +184,7 @@ def measure(name: str, folder: Path, classify: Classify) -> list[dict[str, Any]]
     numbers = twin.held_out.tolist()
     recorded = [recorded_points(twin, number) for number in numbers]
     # The last sweep has no next sweep, so the previous one is used.
-    neighbors = [number + 1 if number + 1 < recording.count else number - 1 for number in numbers]
+    neighbors = [number + 1 if number + 1 < len(recording) else number - 1 for number in numbers]
     compared = {"next recorded sweep": [recorded_points(twin, number) for number in neighbors]}
     for variant, effects in _VARIANTS.items():
         pulses = list(twin.simulate(twin.effective(effects)))

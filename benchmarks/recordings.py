@@ -126,16 +126,10 @@ def read_items(path):
 
     recording = open_recording(path)
     count = 0
-    for number in range(len(recording) if hasattr(recording, "__len__") else recording.count):
-        if hasattr(recording, "__getitem__"):
-            item = recording[number]
-            points, columns = item.points, item.columns
-        else:  # an earlier version
-            points, columns, _ = recording.read(number)
-            if recording.meters != (1, 1, 1):
-                points = points * recording.meters
-        _ = np.asarray(points, np.float64), *map(np.asarray, columns.values())
-        count += len(points)
+    for number in range(len(recording)):
+        item = recording[number]
+        _ = np.asarray(item.points, np.float64), *map(np.asarray, item.columns.values())
+        count += len(item)
     return count
 
 

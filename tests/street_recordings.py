@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.media.materials import normal_incidence_energy
 
@@ -40,7 +40,7 @@ def record(columns_of, *, sweeps=3, name="drive.mcap", threshold=0.0, brightness
         points, energy = street(number, threshold, brightness)
         return Sweep(points, columns_of(energy, np.linalg.norm(points, axis=1)))
 
-    return Recording(name, sweeps, read, **fields)
+    return made_recording(name, sweeps, read, **fields)
 
 
 def reflectances(energy, range_m):

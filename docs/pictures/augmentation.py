@@ -12,7 +12,7 @@ from docs.pictures.film import BACK, RAISED, aim
 from docs.pictures.options import file_parser
 from PIL import Image, ImageDraw
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import RecordingInfo, SweepsInMemory
 from lidarfiles.color_table import TURBO
 from lidarpool import Fault, Pose, Scanner, load_sensor
 from lidarreal.augmentation.augmented_sweep import AugmentedSweep
@@ -55,7 +55,7 @@ def augmenters() -> list[Augmenter]:
     cloud = scanner.sweep(Pose((-6.0, -3.0, HEIGHT_M)))
     columns = {name: cloud[name] for name in ("channel", "intensity")}
     sweep = Sweep(np.asarray(cloud.positions, np.float64), columns)
-    recording = Recording("drive", 1, lambda _: sweep, energy_unit=1.0)
+    recording = SweepsInMemory(RecordingInfo("drive", energy_unit=1.0), [sweep])
     return [Augmenter(recording, effects, model) for effects in PANELS.values()]
 
 

@@ -276,7 +276,7 @@ def test_a_sensor_of_a_cloud_without_sensors_is_refused(tmp_path, file):
     if file is not None:
         save_cloud(cloud, tmp_path / file)
     source = cloud if file is None else tmp_path / file
-    assert open_recording(source, None).count == 1
+    assert len(open_recording(source, None)) == 1
     with pytest.raises(LidarError, match=r"Remove the sensor 'roof'\."):
         open_recording(source, "roof")
 

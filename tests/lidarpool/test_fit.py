@@ -11,9 +11,9 @@ import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, box, place, recorded, street, trial
 from tests.captures import IPV4, MACS, ip_packet, pcap, variants
+from tests.made_recordings import changed_recording, made_recording
 
 from lidarfiles import save_cloud
-from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.recordings.opening import open_recording
 from lidarpool import simulate
@@ -219,13 +219,13 @@ def test_beams_that_begin_beside_zero_bias_no_ring():
     quiet = {"noise": Noise(range_m=0.003), "precision_m": 1e-4, "coordinates": "sensor"}
     scanner = Scanner(street(), sensor, **quiet)
     made = [scanner.sweep((0, 0, 0), number=k) for k in range(4)]
-    found = fit(Recording("os1", 4, lambda k: Sweep(made[k].positions, made[k].columns)))
+    found = fit(made_recording("os1", 4, lambda k: Sweep(made[k].positions, made[k].columns)))
     bias = [row["bias_m"]["value"] for row in found.figures["channels"] if row["bias_m"]]
     assert len(bias) > 15 and np.abs(bias).max() < 0.001
 
 
 def test_a_single_sweep_tells_bias_alone(recording):
-    single = fit(replace(recording, count=1))
+    single = fit(changed_recording(recording, count=1))
     assert not single.figures["figures"] and "there is only one sweep" in repr(single)
     assert single.model.performance is None
     known = [row for row in single.figures["channels"] if row["bias_m"]]
@@ -246,7 +246,7 @@ def drive(scene, height_m, step_m, yaw_deg=0.0, sweeps=6):
     def read(number):
         return Sweep(clouds[number].positions, clouds[number].columns)
 
-    return Recording("drive.pcap", sweeps, read, read_stamps=lambda: 5e7 * np.arange(sweeps))
+    return made_recording("drive.pcap", sweeps, read, read_stamps=lambda: 5e7 * np.arange(sweeps))
 
 
 @pytest.fixture(scope="module")
@@ -335,9 +335,11 @@ def test_poses_of_sweeps_are_used(cluster_client, dropout):
     scene = parked_street()
     survey = survey_along(26, Noise(range_m=0.01, dropout=dropout, seed=2))
     result = open_recording(simulate(scene, survey, client=cluster_client).cloud)
-    located = replace(result, fired=None)
-    unlocated = replace(located, read_poses=None, read=lambda k: result.read(k).replace(pose=None))
-    for recording, pose in ((located, None), (unlocated, result.read_poses())):
+    located = changed_recording(result, fired=None)
+    unlocated = changed_recording(
+        located, read_poses=None, read=lambda k: result.load(k).replace(pose=None)
+    )
+    for recording, pose in ((located, None), (unlocated, result.load_poses())):
         figures = fit(recording, scene=scene, pose=pose).figures["figures"]
         assert figures["dropout"]["value"] == pytest.approx(dropout, rel=0.15, abs=0.001)
         assert figures["range_m"]["value"] == pytest.approx(0.01, rel=0.1)
@@ -386,7 +388,7 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
 
     def passed(number):
         """Points of a van of 5 by 2 m that comes along the street; what is behind it is hidden."""
-        sweep = stands.read(number)
+        sweep = stands.load(number)
         points = sweep.points
         ahead = np.array([8.0 - 1.3 * number, 3.0])
         azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -396,17 +398,17 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
         near = np.where(hit, np.minimum(1, np.hypot(*ahead) / np.maximum(flat, 0.1)), 1)
         return sweep.replace(points=points * near[:, None])
 
-    assert fit(replace(stands, read=passed)).figures["sweeps"] == 6
+    assert fit(changed_recording(stands, read=passed)).figures["sweeps"] == 6
 
 
 @pytest.mark.extended
 def test_points_that_are_not_in_meters_are_refused(recording):
     def scaled(number):
-        sweep = recording.read(number)
+        sweep = recording.load(number)
         return sweep.replace(points=sweep.points * 1000)
 
     with pytest.raises(LidarError, match=r"The ranges in .* change by .* Use points in meters"):
-        fit(replace(recording, read=scaled))
+        fit(changed_recording(recording, read=scaled))
 
 
 @pytest.mark.extended
@@ -415,7 +417,7 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
     whole = recorded(replace(NOISE, dropout=0.0))
 
     def holed(number):
-        sweep = whole.read(number)
+        sweep = whole.load(number)
         points = sweep.points
         azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
         kept = (azimuth > 110) | (number % 3 > 0)
@@ -423,7 +425,7 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
             kept &= (azimuth < begin) | (azimuth > begin + 6)
         return sweep.select(kept)
 
-    fitted = fit(replace(whole, read=holed))
+    fitted = fit(changed_recording(whole, read=holed))
     figures = fitted.figures["figures"]
     lost = figures["dropout"]
     assert lost["value"] < 1e-4
@@ -431,7 +433,7 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
     assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
     assert "% of the cells in the sweeps are gaps, which are runs of cells" in repr(fitted)
     lossy = recorded(replace(NOISE, dropout=0.1))
-    figures = fit(replace(lossy, read=lossy.read)).figures["figures"]
+    figures = fit(changed_recording(lossy, read=lossy.load)).figures["figures"]
     assert figures["dropout"]["low"] < 0.1 < figures["dropout"]["high"]
 
 
@@ -447,7 +449,7 @@ def with_points(recording, chosen, points_of):
     """Keep the chosen points of each sweep, and add others: points (n, 3) of rings (n,)."""
 
     def read(number):
-        sweep = recording.read(number)
+        sweep = recording.load(number)
         added, rings, light = points_of(number)
         return Sweep.concatenate(
             [
@@ -456,7 +458,7 @@ def with_points(recording, chosen, points_of):
             ]
         )
 
-    return replace(recording, read=read)
+    return changed_recording(recording, read=read)
 
 
 def directions_of(rings, columns):
@@ -480,7 +482,7 @@ def test_rings_of_false_alarms_alone_are_of_the_same_sensor(recording):
         return away * rng.uniform(1, 120, (len(rings), 1)), rings, np.full(len(rings), 0.001)
 
     lower = with_points(recording, lambda number, points, rings: rings < 8, alarms)
-    of_sweeps = [len(np.unique(lower.read(k).columns["channel"])) for k in range(lower.count)]
+    of_sweeps = [len(np.unique(lower.load(k).columns["channel"])) for k in range(len(lower))]
     assert max(of_sweeps[:3]) < 14
     fitted = fit(lower)
     assert len(fitted.figures["channels"]) == 16
@@ -527,12 +529,12 @@ def test_ranges_that_drift_are_refused():
     assert fit(steady).figures["figures"]["range_m"]["value"] == pytest.approx(0.006, rel=0.1)
 
     def longer(number):
-        sweep = steady.read(number)
+        sweep = steady.load(number)
         ranges = np.linalg.norm(sweep.points, axis=1, keepdims=True)
         return sweep.replace(points=sweep.points * (1 + 0.003 * number / ranges))
 
     with pytest.raises(LidarError, match=r"The ranges in .* drift: .* over 6 sweeps"):
-        fit(replace(steady, read=longer))
+        fit(changed_recording(steady, read=longer))
 
 
 @pytest.mark.extended
@@ -587,50 +589,54 @@ def test_where_only_the_ground_is_smooth_noise_is_not_determined():
 
 @pytest.mark.extended
 def test_intensities_of_unknown_scale_need_the_white_one():
-    made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energy_unit=None)
+    made = changed_recording(
+        recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energy_unit=None
+    )
     found = fit(made)
     assert "detection_range_m" not in found.figures["figures"]
     assert "--white-intensity" in repr(found)
 
     def calibrated(number):
-        sweep = made.read(number)
+        sweep = made.load(number)
         square = (sweep.points**2).sum(axis=1)
         intensity = sweep.columns["intensity"] * square / 100 * 255
         return sweep.replace(columns={**sweep.columns, "intensity": intensity})
 
-    found = fit(replace(made, read=calibrated), white=255)
+    found = fit(changed_recording(made, read=calibrated), white=255)
     assert found.figures["figures"]["detection_range_m"]["value"] == pytest.approx(10, rel=0.03)
 
 
 @pytest.mark.extended
 def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
     def cut(number):
-        sweep = recording.read(number)
+        sweep = recording.load(number)
         return sweep.select(slice(len(sweep) // 3)) if number == 5 else sweep
 
-    assert "5.6 % of the cells in the sweeps are gaps" in repr(fit(replace(recording, read=cut)))
+    assert "5.6 % of the cells in the sweeps are gaps" in repr(
+        fit(changed_recording(recording, read=cut))
+    )
     other = Scanner(street(), Sensor.grid(360, 40, vertical_fov_deg=80), coordinates="sensor")
     cloud = other.sweep((0, 0, 0))
     foreign = Sweep(cloud.positions, cloud.columns)
 
     def mixed(number):
-        return foreign if number == 5 else recording.read(number)
+        return foreign if number == 5 else recording.load(number)
 
     nothing = Sweep(np.zeros((0, 3)), {"channel": np.zeros(0, int)})
     scattered = Sweep(np.random.default_rng(0).normal(0, 10, (5000, 3)))
     for made, says in (
         (
-            replace(recording, read=mixed),
+            changed_recording(recording, read=mixed),
             "come from different sensors|comes from a different sensor",
         ),
         (
-            replace(recording, read=lambda number: nothing),
+            changed_recording(recording, read=lambda number: nothing),
             "contains no points, so there is nothing to fit",
         ),
-        (replace(recording, count=0), "contains no sweeps"),
-        (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
+        (changed_recording(recording, count=0), "contains no sweeps"),
+        (changed_recording(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
         (
-            replace(recording, read=lambda number: scattered),
+            changed_recording(recording, read=lambda number: scattered),
             "has no ring column",
         ),
     ):
@@ -675,7 +681,7 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     path.write_bytes(pcap(frames))
     opened = open_recording(path)
     sweep = opened[1]
-    assert opened.count >= 3 and opened.white == 100 and set(sweep.intensity) == {50.0}
+    assert len(opened) >= 3 and opened.info.white == 100 and set(sweep.intensity) == {50.0}
     assert len(np.unique(sweep.rings)) == 16
     assert np.linalg.norm(sweep.points, axis=1) == pytest.approx(5, abs=0.05)
     # A sweep has the time of its first packet, and its points have times since then.
@@ -695,10 +701,10 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     ):
         open_recording(path)
     counts = [
-        open_recording(path, sensor=f"{address}:2368").count
+        len(open_recording(path, sensor=f"{address}:2368"))
         for address in ("192.168.1.201", "10.0.0.7")
     ]
-    assert counts == [opened.count, 2]
+    assert counts == [len(opened), 2]
 
 
 def rearranged(packets, order):
@@ -838,7 +844,7 @@ def test_a_velodyne_is_read_from_any_capture(name, tmp_path):
     opened = open_recording(tmp_path / "room.pcap")
     (tmp_path / "plain.pcap").write_bytes(ROOM_CAPTURES["plain"])
     plain = open_recording(tmp_path / "plain.pcap")
-    assert opened.count == plain.count
+    assert len(opened) == len(plain)
     assert np.array_equal(opened[1].points, plain[1].points)
     assert opened.stamps_ns == pytest.approx(plain.stamps_ns, rel=0, abs=2000)
 

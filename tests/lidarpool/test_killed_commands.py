@@ -21,6 +21,7 @@ from tests.kills import count_changes, is_killed
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
 from lidarfiles import save_cloud
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.work import publishing, work
 from lidarfiles.work.work import FOLDER, Step
 from lidarpool.cli import flight_command, stations_command
@@ -29,7 +30,7 @@ from lidarpool.report.result_pictures import publish_pictures
 from lidarreal import twin
 from lidarreal.augmentation.effects import Effects
 from lidarreal.augmentation.running import Augmentation
-from lidarreal.augmentation.sweep_tasks import PartProcess, RecordingFile
+from lidarreal.augmentation.sweep_tasks import PartProcess
 from lidarreal.augmentation.variants import CampaignVariants, Variants
 from lidarreal.comparing.comparison_files import write_comparison
 from lidarreal.comparing.fit import charts, fitting
@@ -160,7 +161,7 @@ class AugmentUser(User):
 
     def augmentation(self, inputs, version):
         effects = replace(Effects.load(options={"weather": {"rain_mm_h": 50}}), seed=version)
-        return Augmentation(RecordingFile(inputs / "drive"), Variants(effects))
+        return Augmentation(RecordingRef(inputs / "drive"), Variants(effects))
 
     def run(self, inputs, outputs, version, *, resume=False):
         augmentation = self.augmentation(inputs, version)
@@ -175,7 +176,7 @@ class AugmentFileUser(AugmentUser):
 
     def augmentation(self, inputs, version):
         augmentation = super().augmentation(inputs, version)
-        return replace(augmentation, file=RecordingFile(inputs / "drive" / "000001.pcd"))
+        return replace(augmentation, file=RecordingRef(inputs / "drive" / "000001.pcd"))
 
 
 class AugmentCampaignUser(AugmentUser):

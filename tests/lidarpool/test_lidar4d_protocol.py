@@ -8,14 +8,13 @@ import statistics
 import sys
 import types
 from contextlib import nullcontext
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.made_recordings import changed_recording, made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarpool.cli.commands import cli
 from lidarreal import compare
 from lidarreal.comparing import lidar4d
@@ -409,7 +408,7 @@ def test_held_out_frames_are_in_the_sensor_frame(pair):
     sweeps = SimpleNamespace(
         read=lambda number: {3: pulses[0], 4: farther[0]}[number],
         alignment=alignment,
-        recorded=SimpleNamespace(recording=SimpleNamespace(energies=False)),
+        recorded=SimpleNamespace(recording=made_recording("drive", 0, None)),
     )
     both = HeldOutRays.concatenate([rays, far_rays])
     frames = HeldOutFrames.from_rays(sweeps, both, {3: pulses, 4: farther})
@@ -452,7 +451,7 @@ def test_a_window_is_read_from_all_frames_or_is_alone(count, first, monkeypatch,
 
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = np.arange(count)
-    recording = Recording(
+    recording = made_recording(
         "frames", count, read, read_stamps=lambda: range(count), read_poses=lambda: poses
     )
     module = "lidarreal.reconstruction.recorded_sweeps"
@@ -463,7 +462,7 @@ def test_a_window_is_read_from_all_frames_or_is_alone(count, first, monkeypatch,
     opened = recorded.recording
     assert opened.poses([0, 50])[:, 0, 3].tolist() == [first, first + 50]
     assert opened.stamps_ns.tolist() == [*range(first, first + 51)]
-    short = replace(recording, count=2000)
+    short = changed_recording(recording, count=2000)
     monkeypatch.setattr(f"{module}.open_recording", lambda *_, **__: short)
     with pytest.raises(LidarError, match="has 2,000 sweeps, but the window consists of the frames"):
         RecordedSweeps.open(tmp_path / "short", window=2350)

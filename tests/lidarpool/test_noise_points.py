@@ -100,7 +100,7 @@ def test_views_leave_them_out(tmp_path):
     assert len(everything.points) == 900 and "skipped" not in everything.note
     for keep_noise, count in ((False, 600), (True, 900)):
         recording = open_recording(path, keep_noise=keep_noise)
-        sample = recording.read_sample(100_000)
+        sample = recording.sample(100_000)
         share = len(sample) / 880  # of runs of 22 points
         assert share == pytest.approx(count / 900, abs=0.05)
         assert all(len(values) == len(sample) for values in sample.columns.values())

@@ -318,7 +318,7 @@ def nuscenes(exported, tmp_path):
 
 def test_one_of_several_versions_of_nuscenes_is_asked_for(nuscenes):
     root, table = nuscenes
-    sweeps = open_recording(root, "LIDAR_TOP").count
+    sweeps = len(open_recording(root, "LIDAR_TOP"))
     shutil.copytree(table.parent, root / "v1.0-mini")
     mini = root / "v1.0-mini" / "sample_data.json"
     mini.write_text(json.dumps(json.loads(table.read_text())[:1]))
@@ -329,7 +329,7 @@ def test_one_of_several_versions_of_nuscenes_is_asked_for(nuscenes):
             f"{root} contains several versions of nuScenes: v1.0-lidarpool, v1.0-mini. Specify the "
             f"folder of one version, for example {root}/v1.0-lidarpool."
         )
-    assert open_recording(table.parent, "LIDAR_TOP").count == sweeps
+    assert len(open_recording(table.parent, "LIDAR_TOP")) == sweeps
     one = open_recording(mini.parent)
     assert len(one) == 1 and len(one[0].returns()) > 100
 

@@ -297,14 +297,13 @@ def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
         {"lidarpool.clouds": {"lines": "line_cloud:Lines"}},
         {
             "line_cloud.py": "import numpy as np\n"
-            "from lidarpool.plugins import CloudFormat, FormatRow, Sweep\n"
+            "from lidarpool.plugins import CloudFormat, FormatRow, Sweep, SweepsInMemory\n"
             "class Lines(CloudFormat):\n"
             "    row = FormatRow('', suffixes=('.lines',))\n"
             "    for_scenes = True\n"
             "    @classmethod\n"
-            "    def open(cls, source):\n"
-            "        points = np.loadtxt(source.path)\n"
-            "        return source.recording(1, lambda number: Sweep(points))\n"
+            "    def open(cls, ref):\n"
+            "        return SweepsInMemory(ref.info(), [Sweep(np.loadtxt(ref.path))])\n"
         },
     )
     points = np.arange(60.0).reshape(20, 3)

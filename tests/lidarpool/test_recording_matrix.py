@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarfiles import open_recording, save_cloud
+from lidarfiles import PointCloud, Recording, open_recording, save_cloud
 from lidarfiles.recordings.opening import open_sensors
 from lidarpool.pages.recorded import recorded_view
 from lidarreal import compare
@@ -112,7 +112,7 @@ def test_sweeps_are_the_same_in_every_format(result, exported):
     name, path, losses = exported
     truth = open_recording(cloud)
     recording = open_recording(path)
-    assert len(recording) == SWEEPS and not recording.is_cloud
+    assert len(recording) == SWEEPS and isinstance(recording, Recording)
     if "stamps" not in losses:
         tolerance_ns = 3e6 if "bounds" in losses else 60_000
         np.testing.assert_allclose(np.diff(recording.stamps_ns), PERIOD_NS, atol=tolerance_ns)
@@ -128,7 +128,7 @@ def test_sweeps_are_the_same_in_every_format(result, exported):
         returns = sweep.returns()
         if "bounds" in losses:
             continue
-        expected = truth.read_fired(number) if name in AS_FIRED else truth[number].returns()
+        expected = truth.fired(number) if name in AS_FIRED else truth[number].returns()
         rows = nearest(returns.points, expected.points)
         for column in ("class", "object"):
             if column in losses:
@@ -157,7 +157,7 @@ def test_a_capture_has_the_same_points_between_other_bounds(result):
 
     cloud, _, _ = result
     path = export(result, "pcap")
-    truth = [open_recording(cloud).read_fired(number) for number in range(SWEEPS)]
+    truth = [open_recording(cloud).fired(number) for number in range(SWEEPS)]
     for sweep, compensated in zip(truth, open_recording(cloud), strict=True):
         np.testing.assert_array_equal(sweep.times_s, compensated.times_s)
     sweeps = [sweep.returns() for sweep in open_recording(path)]
@@ -218,7 +218,7 @@ def test_fits_and_twins_find_the_same_rings(result, exported):
     if "bounds" in losses:
         return
     sweep = recorded.read(9)
-    fired = truth.read_fired(9) if name in AS_FIRED else truth[9].returns()
+    fired = truth.fired(9) if name in AS_FIRED else truth[9].returns()
     rows = nearest(sweep.points, fired.points)
     channels = fired.columns["channel"][rows].astype(int)
     np.testing.assert_array_equal(sweep.columns["row"], channels.max() - channels)
@@ -239,7 +239,8 @@ def test_clouds_without_sweeps_have_the_same_points(result, name):
     path = folder / file
     save_cloud(cloud, path, format=name)
     recording = open_recording(path)
-    assert recording.is_cloud and len(recording) == 1 and recording.point_count == len(cloud)
+    assert isinstance(recording, PointCloud)
+    assert len(recording) == 1 and recording.info.point_count == len(cloud)
     np.testing.assert_allclose(recording[0].points, cloud.positions, atol=1e-9)
     for column in ("channel", "class", "object"):
         np.testing.assert_array_equal(recording[0].columns[column], cloud.columns[column])

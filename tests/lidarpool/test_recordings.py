@@ -8,13 +8,13 @@ import re
 import sys
 import tarfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from tests.made_recordings import changed_recording
 
 from lidarfiles.recordings.opening import open_recording
 from lidarpool.pages.opened import open_view
@@ -155,7 +155,7 @@ def test_poses_that_are_not_finite_are_refused(tmp_path, value, element):
     for read in (lambda: recording[1], lambda: recording.poses([0, 1])):
         with pytest.raises(LidarError, match="the pose of sweep 1 is not finite"):
             read()
-    recording = replace(recording, read_poses=lambda: np.full((3, 4, 4), value))
+    recording = changed_recording(recording, read_poses=lambda: np.full((3, 4, 4), value))
     with pytest.raises(LidarError, match="the pose of sweep 2 is not finite"):
         recording.poses([2])
 
@@ -382,7 +382,7 @@ def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
 def test_a_single_topic_is_the_name_of_the_sensor(tmp_path):
     path = write_bag(tmp_path / "bag", drive(relative))
     recording = open_recording(path)
-    assert recording.sensor == recording[0].sensor == "/points"
+    assert recording.info.sensor == recording[0].sensor == "/points"
     assert open_view(path).sweeps.sensors == ("/points",)
     kitti(tmp_path / "kitti", range(3), 3)
     assert open_view(tmp_path / "kitti").sweeps.sensors == ("",)
@@ -476,7 +476,7 @@ def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
     assert first_x(recording) == [1, 2, 3]
     assert [*recording.stamps_ns] == [100, 200, 300]
     write_tar("shard-11.tar", {"e": (4, "{}")})
-    assert open_recording(tmp_path).read_stamps is None
+    assert open_recording(tmp_path).stamps_ns is None
 
 
 # -- poses -----------------------------------------------------------------------------------

@@ -438,7 +438,7 @@ def test_recordings_of_each_layout_are_read_back(layout, organized, tmp_path):
     cloud = cast("hesai/xt32" if layout == "hesai" else "velodyne/vlp16")
     save_cloud(cloud, tmp_path / "c.mcap", layout=layout, organized=organized)
     recording = open_recording(tmp_path / "c.mcap")
-    assert recording.count == 2
+    assert len(recording) == 2
     points = sweep_of(cloud, 1)
     positions = cloud.sweeps().as_fired(1, points)
     read = recording[1].returns()
@@ -477,7 +477,7 @@ def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
                 writer.write(topic, time_ns, data)
     old = open_recording(tmp_path / "old")
     points = old[1].points
-    assert old.count == 2
+    assert len(old) == 2
     expected = open_recording(tmp_path / "c.mcap")[1].points
     np.testing.assert_array_equal(points, expected)
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from benchmarks.fit_coverage import box
 from click.testing import CliRunner
+from tests.made_recordings import changed_recording, made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarpool.cli.commands import cli
 from lidarreal import fit_pattern
 from lidarsim import LidarError, Noise, Scanner, Scene, Sensor, Spin, Track, load_sensor
@@ -67,7 +65,7 @@ def record(
         recorded.append(Sweep(np.asarray(cloud.positions)[kept], used))
     stamps_ns = period_ns * np.arange(sweeps)
     stamps = (lambda: stamps_ns) if are_stamped else None
-    return Recording("recording", sweeps, recorded.__getitem__, read_stamps=stamps)
+    return made_recording("recording", sweeps, recorded.__getitem__, read_stamps=stamps)
 
 
 def reloaded(fitted, folder):
@@ -167,9 +165,9 @@ def test_points_sorted_by_ring_lack_whole_azimuth_steps(room):
     recording = record(room, load_sensor("ouster/os1-32", columns=512), columns=["channel"])
     by_ring = [
         sweep.select(np.argsort(sweep.columns["channel"], kind="stable"))
-        for sweep in map(recording.read, range(2))
+        for sweep in map(recording.load, range(2))
     ]
-    fitted = fit_pattern(replace(recording, read=by_ring.__getitem__))
+    fitted = fit_pattern(changed_recording(recording, read=by_ring.__getitem__))
     assert any("except for whole azimuth steps" in note for note in fitted.figures["notes"])
     assert fitted.figures["clockwise"]
 
@@ -185,14 +183,14 @@ def test_a_pattern_that_does_not_repeat_is_listed(room, tmp_path, name, lost):
     fitted = fit_pattern(recording, as_rays=True)
     found = fired_rays(load_sensor(calibration=fitted.save(tmp_path / "rays.npz")[0]), seconds=0.3)
     true = fired_rays(sensor, seconds=0.3)
-    first_ns = round(1e9 * recording.read(0).columns["time"].min())
+    first_ns = round(1e9 * recording.load(0).columns["time"].min())
     key = (fitted.rays.times_ns + first_ns) * 100 + fitted.rays.channels
     all_keys = true.times_ns * 100 + true.channels
     order = np.argsort(all_keys)
     place = order[np.searchsorted(all_keys[order], key)]
     np.testing.assert_array_equal(all_keys[place], key)
     assert angles_deg(found.directions, true.directions[place]).max() < MAX_ERROR_DEG
-    assert len(found) == sum(len(recording.read(number)) for number in range(3))
+    assert len(found) == sum(len(recording.load(number)) for number in range(3))
     # Pulses before the first and after the last return of a channel are unknown.
     assert len(true) - len(found) - 60 <= fitted.figures["missing"] <= len(true) - len(found)
     assert fitted.figures["spread_deg"] < 0.003
@@ -286,7 +284,7 @@ def test_few_returns_are_refused(room):
 
 
 def test_the_command_selects_the_form_by_extension(room, tmp_path):
-    sweep = record(room, load_sensor("velodyne/vlp16"), 1).read(0)
+    sweep = record(room, load_sensor("velodyne/vlp16"), 1).load(0)
     columns = [sweep.points, sweep.columns["channel"][:, None], sweep.columns["time"][:, None]]
     table = tmp_path / "scan.csv"
     values = np.concatenate(columns, axis=1)

@@ -188,7 +188,7 @@ def test_points_of_an_e57_are_limited_by_the_file(tmp_path, monkeypatch):
     zeros = np.zeros(1000)
     with pye57.E57(str(path), mode="w") as file:
         file.write_scan_raw({f"cartesian{axis}": zeros for axis in "XYZ"})
-    assert open_recording(path).count == 1
+    assert len(open_recording(path)) == 1
     monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 0)
     monkeypatch.setattr(allowance, "UNPACKED_TIMES", 0.5)
     assert "would unpack to at least 23.44 kiB" in refused(open_recording, path)

@@ -14,9 +14,9 @@ import pytest
 import trimesh
 from click.testing import CliRunner
 from rasterio.crs import CRS
+from tests.made_recordings import MadeCloud
 
 from lidarfiles import open_recording
-from lidarfiles.clouds.recording import Recording
 from lidarpool.cli.commands import cli
 from lidarreal import compare, compare_strips, compare_surveys
 from lidarreal.comparing.surveys import pairs, planes
@@ -445,8 +445,8 @@ def test_normals_face_the_scanner_of_their_surface(known):
 @pytest.mark.parametrize("counts", [(1000,) * 8, (300, 5000, 20, 1500, 1180)])
 def test_a_sample_is_even_if_the_number_of_points_is_unknown(counts):
     parts = [Sweep(np.full((count, 3), number + 1.0)) for number, count in enumerate(counts)]
-    recording = Recording("scans", len(counts), parts.__getitem__, is_cloud=True)
-    points, notes = SurveyCloud("scans", (recording,), None).sample(2000)
+    scans = MadeCloud("scans", parts)
+    points, notes = SurveyCloud("scans", (scans,), None).sample(2000)
     found = np.bincount(points.positions[:, 0].astype(int) - 1)
     np.testing.assert_allclose(found, np.array(counts) / 4, atol=3)
     assert notes == ["25 % of the points in scans are used, sampled evenly"]
@@ -841,7 +841,7 @@ def test_facades_are_seen_from_the_front_and_the_scale_contains_a_small_change(t
     assert (tmp_path / "out" / "compare-facades.png").stat().st_size > 10_000
 
     written = laspy.read(tmp_path / "deviations.laz")
-    assert open_recording(tmp_path / "deviations.laz").epsg == 25832
+    assert open_recording(tmp_path / "deviations.laz").info.epsg == 25832
     found = compare_surveys(a, b, method="planes", radius_m=0.7)
     assert len(written.points) == len(found.points) > 14_000
     distances = found.components["distance"]

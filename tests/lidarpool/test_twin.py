@@ -12,11 +12,11 @@ from benchmarks import reality
 from benchmarks.odometry import left_turn
 from click.testing import CliRunner
 from scipy.spatial import cKDTree
+from tests.made_recordings import changed_recording, made_recording
 from tests.simulated_drives import simulated_drive, simulated_points
 
 from lidarfiles import save_cloud
 from lidarfiles.clouds.point_times import PointTimes
-from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.rings import Rings
 from lidarfiles.recordings.opening import open_recording
 from lidarpool.cli.commands import cli
@@ -156,7 +156,7 @@ def without_poses(drive, rows=None):
             return Sweep(sweep.points, columns | {"ring": sweep.columns["channel"]})
         return Sweep(sweep.points, columns).select(rows(sweep.points, sweep.columns))
 
-    return Recording("drive", len(opened), read)
+    return made_recording("drive", len(opened), read)
 
 
 @pytest.mark.extended
@@ -261,7 +261,7 @@ def test_rings_start_where_their_first_pulses_are():
     )
     returned = (ring >= 5) | (column >= 80)
     order = np.flatnonzero(returned)
-    recording = Recording("drive", 4, lambda _: Sweep(points[order], {"ring": ring[order]}))
+    recording = made_recording("drive", 4, lambda _: Sweep(points[order], {"ring": ring[order]}))
     sweep = RecordedSweeps.from_recording(recording).read(1)
     turn = Motion.COUNTERCLOCKWISE.times_s(sweep, 1.0)
     known = ring[order] >= 5
@@ -421,7 +421,7 @@ def test_intensities_that_are_compensated_for_range_are_found(drive, survey):
         intensity = sweep.intensity * np.square(sweep.points).sum(axis=1)
         return sweep.replace(columns={**sweep.columns, "intensity": intensity})
 
-    found = twin(replace(opened, read=read, energy_unit=None))
+    found = twin(changed_recording(opened, read=read, energy_unit=None))
     assert found.figures["response"]["model"] == "compensated for range"
     elevation_deg = np.sort(np.degrees(survey.sensor.beams.elevation))
     np.testing.assert_allclose(found.model.beams.elevation_deg, elevation_deg, atol=0.002)
@@ -457,7 +457,7 @@ def test_times_of_points_have_one_unit_and_tell_the_period(drive):
             found = Sweep(sweep.points, {"ring": sweep.columns["channel"], "time": time})
             return found.select(slice({3: 0, 4: 6}.get(number)))
 
-        return Recording("drive", len(opened), read)
+        return made_recording("drive", len(opened), read)
 
     fired_s = (opened[4].columns["time"][:6] % 100_000_000) * 1e-9
     absolute_s = 1.7e9
@@ -494,7 +494,7 @@ def test_kept_sweeps_are_as_they_were_read(drive):
         columns = {"ring": sweep.rings, "intensity": sweep.intensity.astype(np.float32)}
         return Sweep(points, columns | {"label": np.full(len(points), 50)})
 
-    sweeps = RecordedSweeps.from_recording(Recording("drive", len(opened), read))
+    sweeps = RecordedSweeps.from_recording(made_recording("drive", len(opened), read))
     kept = sweeps.with_cached([2, 5])
     for number in (2, 5, 7):
         one, other = sweeps.read(number), kept.read(number)
@@ -569,7 +569,7 @@ def test_few_points_and_unknown_intensities_change_no_others(drive):
         # Of a ring alone: the beginning of a sweep, or the rest of one with lost packets.
         return found.select(np.flatnonzero(sweep.rings == 12)[:60]) if number == 5 else found
 
-    found = twin(replace(opened, read=read))
+    found = twin(changed_recording(opened, read=read))
     truth = opened.poses(range(SWEEPS))
     relative = np.linalg.inv(found.poses[4]) @ found.poses[5]
     expected = np.linalg.inv(truth[4]) @ truth[5]
@@ -582,7 +582,7 @@ def test_few_points_and_unknown_intensities_change_no_others(drive):
 def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     recording = without_poses(drive)
     with pytest.raises(LidarError, match="has 3 sweeps, but a reconstruction requires at least 4"):
-        twin(replace(recording, count=3))
+        twin(changed_recording(recording, count=3))
     shuffled = without_poses(
         drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
     )
@@ -591,14 +591,14 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     ):
         twin(shuffled)
     with pytest.raises(LidarError, match="has no column 'nope' that could be used as intensity"):
-        twin(replace(recording, intensity_column="nope"))
-    empty = Recording("drive", 9, lambda _: Sweep(np.zeros((0, 3))))
+        twin(changed_recording(recording, intensity_column="nope"))
+    empty = made_recording("drive", 9, lambda _: Sweep(np.zeros((0, 3))))
     with pytest.raises(LidarError, match="drive contains no points"):
         twin(empty)
     unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
     unknown[7, 0, 3] = np.nan
     with pytest.raises(LidarError, match="the pose of sweep 7 is not finite"):
-        twin(replace(recording, read_poses=lambda: unknown))
+        twin(changed_recording(recording, read_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     with pytest.raises(LidarError, match="contains 2 poses, but drive has 12 sweeps without times"):
@@ -614,7 +614,9 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
         level = sweep.points[:, 2] < -1.75  # of the floor, 1.8 m below the sensor
         return Sweep(sweep.points, {"ring": sweep.rings, "class": np.where(level, 11, 50)})
 
-    found = twin(replace(opened, read=read, read_classes=lambda: {11: "floor", 50: "house"}))
+    found = twin(
+        changed_recording(opened, read=read, read_classes=lambda: {11: "floor", 50: "house"})
+    )
     found.save(tmp_path / "twin")
     job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
     assert job.survey.classes == {0: "unlabeled", 11: "floor", 50: "house"}
@@ -679,11 +681,11 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     order = np.random.default_rng(3).permutation(len(part.columns["channel"]))
     points = part.cloud((SCAN,), 1e-4, street.origin).positions[order] - (0, 0, 1.8)
     channel = part.columns["channel"][order]
-    recording = Recording("drive", 4, lambda number: Sweep(points[number::4]))
+    recording = made_recording("drive", 4, lambda number: Sweep(points[number::4]))
     assert "the elevation angles of the points" in recording.rings.note
     np.testing.assert_array_equal(recording[2].rings, channel[2::4] - channel.min())
     moved = points + np.outer(np.linspace(0, 0.5, len(points)), [1, 0, 0])
-    compensated = Recording("drive", 4, lambda number: Sweep(moved[number::4]))
+    compensated = made_recording("drive", 4, lambda number: Sweep(moved[number::4]))
     assert "its rings cannot be determined" in compensated.rings.note
     assert compensated[2].rings is None
 
@@ -750,7 +752,7 @@ def test_poses_are_found_in_a_city(tmp_path):
         return Sweep(sweep.points, sweep.columns)
 
     truth = opened.poses(range(24))
-    found = twin(Recording("drive", 24, read))
+    found = twin(made_recording("drive", 24, read))
     assert found.figures["poses"] == "from registration"
     assert found.figures["motion"] == "as fired, with point times"
     relative = np.linalg.inv(found.poses[0]) @ found.poses
@@ -770,9 +772,11 @@ def test_a_mirrored_recording_is_refused_and_a_sensor_that_stood_is_noted(drive)
         return sweep.replace(points=sweep.points * (1, -1, 1))
 
     with pytest.raises(LidarError, match="fit its poses better with y inverted"):
-        twin(replace(recording, read=mirrored, fired=None))
+        twin(changed_recording(recording, read=mirrored, fired=None))
     first = opened[0]
-    stood = twin(replace(opened, read=lambda _: first, count=6, read_stamps=None, read_poses=None))
+    stood = twin(
+        changed_recording(opened, read=lambda _: first, count=6, read_stamps=None, read_poses=None)
+    )
     assert any("the sensor was stationary" in note for note in stood.figures["notes"])
 
 
@@ -788,7 +792,7 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
         sweep = opened[number]
         return Sweep(sweep.points @ tilt[:3, :3].T, {"ring": sweep.rings})
 
-    found = twin(Recording("drive", SWEEPS, read, read_poses=lambda: poses))
+    found = twin(made_recording("drive", SWEEPS, read, read_poses=lambda: poses))
     performance = found.model.performance
     assert performance.range_m < 0.005 and performance.detection is None
     assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
@@ -816,7 +820,7 @@ def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place
         found = Sweep(sweep.points, {"ring": sweep.rings})
         return found.select(slice(0)) if number == 3 else found
 
-    found = twin(Recording("drive", len(opened), read), trajectory=trajectory)
+    found = twin(made_recording("drive", len(opened), read), trajectory=trajectory)
     np.testing.assert_allclose(found.times_s, 0.2 * np.arange(SWEEPS), atol=1e-9)
     steps = np.diff(found.poses[:, :3, 3], axis=0)
     np.testing.assert_allclose(steps[:, 1], SPEED_M_S * PERIOD_S, atol=0.01)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 from tests.lidarpool.test_twin import city_drive
+from tests.made_recordings import made_recording
 
 from lidarfiles import save_cloud
-from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarreal import twin
 from lidarreal.reconstruction.blocked_directions import PulseCounts, separated_sweeps
@@ -42,12 +42,12 @@ def fired(cloud, rows=None):
     opened = open_recording(cloud, name="drive")
 
     def read(number):
-        sweep = opened.read_fired(number).returns()
+        sweep = opened.fired(number).returns()
         columns = {"ring": sweep.columns["channel"], "intensity": sweep.intensity}
         kept = slice(None) if rows is None else rows(sweep)
         return Sweep(sweep.points, columns).select(kept)
 
-    return Recording("drive", len(opened), read)
+    return made_recording("drive", len(opened), read)
 
 
 def azimuth_deg(points):
@@ -108,7 +108,7 @@ def test_the_directions_that_a_vehicle_blocks_are_found(drive):
 def test_a_drive_without_a_vehicle_has_no_blocked_directions(drive):
     """Some pulses meet the sky in all sweeps, also straight ahead between houses."""
     recording = fired(drive)
-    assert 0.1 < np.mean([len(recording.read(k)) for k in range(SWEEPS)]) / (32 * COLUMNS) < 0.95
+    assert 0.1 < np.mean([len(recording.load(k)) for k in range(SWEEPS)]) / (32 * COLUMNS) < 0.95
     assert find_sectors(recording) == []
 
 
@@ -124,11 +124,11 @@ def test_a_sensor_without_rings_has_no_blocked_directions(drive):
     scattered = np.random.default_rng(1).permutation(20_000)
 
     def read(number):
-        points = opened.read(number).points
+        points = opened.load(number).points
         order = scattered[scattered < len(points)]
         return Sweep(points[order] + np.random.default_rng(number).normal(0, 0.3, (len(order), 3)))
 
-    recorded = RecordedSweeps.from_recording(Recording("drive", SWEEPS, read))
+    recorded = RecordedSweeps.from_recording(made_recording("drive", SWEEPS, read))
     assert not len(recorded.lasers)
     coverage = SensorCoverage.from_sweeps(recorded)
     assert coverage.with_blocked(recorded, np.arange(SWEEPS)) is coverage

@@ -52,12 +52,13 @@ def test_a_folder_has_one_reconstruction_at_a_time(bag, tmp_path):
 def test_another_process_reads_the_recording_from_its_own_folder(bag, tmp_path, monkeypatch):
     monkeypatch.chdir(bag.parent)
     recorded = RecordedSweeps.open(Path(bag.name))
-    assert recorded.recording.name == bag.name  # as given, for messages
+    assert recorded.recording.info.name == bag.name  # as given, for messages
     points = recorded.read(0).points
     sent = pickle.dumps(recorded)
     monkeypatch.chdir(tmp_path)
     received = pickle.loads(sent)
-    assert received.source[0] == bag
+    assert received.recording.info.name == bag.name
+    assert received.ref.located.path == bag
     np.testing.assert_array_equal(received.read(0).points, points)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.comparing.fit.performance import fit_threshold
 from lidarreal.comparing.fit.planes import RangeChanges, range_scatter
 from lidarreal.comparing.fit.smooth_surfaces import MAX_KINK_PER_M, SmoothRays
@@ -40,7 +40,7 @@ def room(position=(0, 0, 0), yaw_rad=0.0, longer_m=0.0):
 
 
 def stack_of(*sweeps):
-    return SweepStack.read(Recording("room", len(sweeps), sweeps.__getitem__))
+    return SweepStack.read(made_recording("room", len(sweeps), sweeps.__getitem__))
 
 
 @pytest.mark.parametrize(

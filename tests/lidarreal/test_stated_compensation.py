@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from tests.fake_augmenters import identity, rewrite
+from tests.made_recordings import made_recording
 from tests.simulated_drives import simulated_drive
 
 import lidarfiles
-from lidarfiles import open_recording, save_cloud
+from lidarfiles import PointCloud, open_recording, save_cloud
 from lidarfiles.clouds.format_table import DATA_SETS
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
+from lidarfiles.recordings.opening import open_ref
 from lidarreal import compare
-from lidarreal.augmentation.conversion import open_converter
+from lidarreal.augmentation.conversion import FormatConverter
 from lidarreal.comparing.surveys.survey_clouds import SurveyCloud
 from lidarreal.reconstruction.alignment import first_alignment
 from lidarreal.reconstruction.motion import Motion
@@ -102,7 +104,7 @@ def test_sweeps_of_data_sets_state_their_compensation(name, coordinates, tmp_pat
     compensated = coordinates == "world" or name in ("kitti", "nuscenes")
     truth = drive("world" if compensated else "sensor")
     recording = open_recording(folder)
-    assert recording.compensated is compensated
+    assert recording.info.compensated is compensated
     for number in (1, 5):
         sweep = lidarfiles.sweeps(folder)[number]
         assert sweep.compensated is compensated
@@ -115,7 +117,7 @@ def test_sweeps_of_data_sets_state_their_compensation(name, coordinates, tmp_pat
 def test_data_sets_of_different_jobs_state_no_common_compensation(tmp_path):
     folder = write_data_set(tmp_path, "webdataset", drive(), drive("sensor"))
     recording = open_recording(folder)
-    assert recording.compensated is None
+    assert recording.info.compensated is None
     assert [recording[number].compensated for number in (0, SWEEPS)] == [True, False]
 
 
@@ -132,12 +134,12 @@ def test_conversions_state_what_their_source_states(compensated, is_stated, name
         path.write_bytes(rest)
     stated = compensated if is_stated else None
     recording = open_recording(folder, keep_noise=True)
-    assert recording.compensated is stated
-    converter = open_converter(folder, recording, ExportSpec(name))
+    assert recording.info.compensated is stated
+    converter = FormatConverter(RecordingRef(folder), recording, ExportSpec(name))
     target = tmp_path / f"new{converter.ending}"
     rewrite(converter, target, tmp_path / "work", identity)
     converted = open_recording(target)
-    assert converted.compensated is stated
+    assert converted.info.compensated is stated
     assert (converted[3].times_s is None) == compensated
 
 
@@ -161,7 +163,7 @@ def test_a_twin_uses_the_compensation_that_files_state(key, tmp_path):
     ExportSpec(name).check_installed()
     save_cloud(drive(scene=corridor()), tmp_path / file, format=name, **options)
     recording = open_recording(tmp_path / file)
-    assert recording.compensated is compensated
+    assert recording.info.compensated is compensated
     assert recording[3].compensated is compensated
     _, alignment = aligned(recording)
     assert alignment.motion is (Motion.COMPENSATED if compensated else Motion.TIMED)
@@ -171,7 +173,7 @@ def test_a_twin_uses_the_compensation_that_files_state(key, tmp_path):
 def test_training_formats_state_points_as_fired(name, tmp_path):
     save_cloud(drive("sensor", corridor()), tmp_path / "new", format=name)
     recording = open_recording(tmp_path / "new")
-    assert recording.compensated is False
+    assert recording.info.compensated is False
     assert recording[3].compensated is False
     _, alignment = aligned(recording)
     assert alignment.motion is Motion.TIMED
@@ -180,7 +182,7 @@ def test_training_formats_state_points_as_fired(name, tmp_path):
 def test_packets_are_as_fired(tmp_path):
     save_cloud(drive(sensor=load_sensor("velodyne/vlp16")), tmp_path / "pcap", format="pcap")
     recording = open_recording(tmp_path / "pcap" / "lidar.pcap")
-    assert recording.compensated is False
+    assert recording.info.compensated is False
     assert recording[3].compensated is False
 
 
@@ -194,7 +196,7 @@ def test_points_as_fired_without_times_are_compensated_by_their_azimuth():
             columns = {"channel": sweep.columns["channel"]}
             return Sweep(sweep.points, columns, pose=sweep.pose).select(order)
 
-        return Recording("drive", SWEEPS, read, compensated=compensated)
+        return made_recording("drive", SWEEPS, read, compensated=compensated)
 
     assert aligned(recording(None))[1].motion is Motion.COMPENSATED
     assert aligned(recording(True))[1].motion is Motion.COMPENSATED
@@ -262,11 +264,11 @@ def test_points_as_fired_without_times_are_noted():
         sweep = fired[number]
         return Sweep(sweep.points, {"channel": sweep.columns["channel"]}, pose=sweep.pose)
 
-    sweeps = PosedSweeps(Recording("drive", SWEEPS, read, compensated=False))
+    sweeps = PosedSweeps(made_recording("drive", SWEEPS, read, compensated=False))
     assert sweeps.read(1).firing_poses is None
     (note,) = sweeps.notes
     assert note.startswith("drive contains points as fired, but not the times of its points")
-    still = PosedSweeps(Recording("drive", 1, read, compensated=False))
+    still = PosedSweeps(made_recording("drive", 1, read, compensated=False))
     assert still.read(0).firing_poses is None and not still.notes
 
 
@@ -276,8 +278,8 @@ def test_points_as_fired_are_converted_to_world_coordinates(name, tmp_path):
     spec.check_installed()
     ExportSpec("mcap").check_installed()
     save_cloud(drive("sensor"), tmp_path / "drive.mcap")
-    recording = open_recording(tmp_path / "drive.mcap", keep_noise=True)
-    converter = open_converter(tmp_path / "drive.mcap", recording, spec)
+    ref = RecordingRef(tmp_path / "drive.mcap", keep_noise=True)
+    converter = FormatConverter(ref, open_ref(ref), spec)
     target = tmp_path / f"new{converter.ending}"
     notes = rewrite(converter, target, tmp_path / "work", identity)
     assert not any("as fired" in note for note in notes)
@@ -285,7 +287,7 @@ def test_points_as_fired_are_converted_to_world_coordinates(name, tmp_path):
     converted = open_recording(target)
     parts = [converted[number] for number in range(len(converted))]
     points = np.concatenate(
-        [part.points if converted.is_cloud else part.in_world() for part in parts]
+        [part.points if isinstance(converted, PointCloud) else part.in_world() for part in parts]
     )
     assert len(points) == len(truth)
     assert cKDTree(truth.positions).query(points)[0].max() < 3 * TOLERANCE_M
@@ -293,7 +295,7 @@ def test_points_as_fired_are_converted_to_world_coordinates(name, tmp_path):
 
 def test_conversions_note_points_as_fired_without_times_of_sweeps(tmp_path):
     save_cloud(drive("sensor"), tmp_path / "drive", format="pcd")
-    recording = open_recording(tmp_path / "drive", keep_noise=True)
-    converter = open_converter(tmp_path / "drive", recording, ExportSpec("ply"))
+    ref = RecordingRef(tmp_path / "drive", keep_noise=True)
+    converter = FormatConverter(ref, open_ref(ref), ExportSpec("ply"))
     notes = rewrite(converter, tmp_path / "new.ply", tmp_path / "work", identity)
     assert any("as fired, but not the times of its sweeps. All points" in note for note in notes)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from tests.city_drives import CARS, car_drive, car_position
 from tests.drives import points_of, the_scene, the_survey
+from tests.made_recordings import changed_recording, made_recording
 
 from lidarfiles import save_cloud
 from lidarfiles.clouds.recorded_boxes import RecordedBoxes
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import RecordingSection
 from lidarfiles.recordings.opening import open_recording
 from lidarreal import twin
 from lidarreal.reconstruction.moving_objects import find_tracks
@@ -359,8 +360,8 @@ def test_labels_of_kitti_tracking_are_read(tmp_path):
 
 
 def test_boxes_of_a_section_are_numbered_from_its_start(boxes):
-    recording = Recording("drive", 3, lambda _: None, read_boxes=lambda: boxes)
-    found = recording.section(1, 2).boxes
+    recording = made_recording("drive", 3, lambda _: None, read_boxes=lambda: boxes)
+    found = RecordingSection(recording, 1, 2).boxes
     assert isinstance(found, RecordedBoxes)
     assert sorted(set(found.sweep.tolist())) == [0, 1]
     np.testing.assert_array_equal(found.poses, boxes.poses[boxes.sweep >= 1])
@@ -368,9 +369,9 @@ def test_boxes_of_a_section_are_numbered_from_its_start(boxes):
 
 def test_boxes_are_required_if_they_were_chosen():
     opened = open_recording(the_cloud(), "front", name="cloud")
-    recording = replace(
+    recording = changed_recording(
         opened,
-        read=lambda number: opened.read(number % 3),
+        read=lambda number: opened.load(number % 3),
         read_boxes=None,
         read_poses=None,
         fired=None,

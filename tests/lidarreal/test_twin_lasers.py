@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.odometry import left_turn
+from tests.made_recordings import made_recording
 from tests.simulated_drives import simulated_drive
 
-from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarreal import twin
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
@@ -169,7 +169,7 @@ def test_held_out_rays_do_not_depend_on_the_recorded_ranges():
             far = origins + factor * (points - origins) if number == 2 else points
             return Sweep(far, {"ring": ring, "time": np.zeros(len(ring))})
 
-        return RecordedSweeps.from_recording(Recording("drive", 4, read))
+        return RecordedSweeps.from_recording(made_recording("drive", 4, read))
 
     poses = np.tile(np.eye(4), (4, 1, 1))
     rays = []
@@ -250,11 +250,11 @@ def as_fired(drive):
     opened = open_recording(drive, name="drive")
 
     def read(number):
-        sweep = opened.read_fired(number)
+        sweep = opened.fired(number)
         time_s = 1e-9 * sweep.columns["time"]
         return Sweep(sweep.points, {"ring": sweep.rings, "timestamp": time_s})
 
-    return Recording("drive", len(opened), read)
+    return made_recording("drive", len(opened), read)
 
 
 @pytest.fixture(scope="module")

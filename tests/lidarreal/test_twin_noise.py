@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from tests.lidarreal.test_twin_lasers import recorded_drive, room_sweep, true_lasers
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarfiles.recordings.opening import open_recording
 from lidarreal import twin
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, align
@@ -43,7 +43,7 @@ def noisy_room(sigma_m, pose_error_m=0.0, bias_m=0.0):
         beams *= 1 + (errors_m / np.linalg.norm(beams, axis=1))[:, None]
         time_s = np.zeros(len(ring))
         sweeps.append(Sweep(origins + beams, {"ring": ring, "time": time_s}))
-    recorded = RecordedSweeps.from_recording(Recording("room", 4, sweeps.__getitem__))
+    recorded = RecordedSweeps.from_recording(made_recording("room", 4, sweeps.__getitem__))
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = 0.3 * np.arange(4)
     poses[:, :3, 3] += pose_error_m * random.standard_normal((4, 3))
@@ -98,7 +98,7 @@ def calibrated():
         range_m = np.linalg.norm(points, axis=1) + bias_m[ring]
         points = range_m[:, None] * unit_vectors(azimuth, elevation - error_rad[ring])
         sweeps.append(Sweep(points, {"ring": ring, "time": np.zeros(len(ring))}))
-    recorded = RecordedSweeps.from_recording(Recording("room", SWEEPS, sweeps.__getitem__))
+    recorded = RecordedSweeps.from_recording(made_recording("room", SWEEPS, sweeps.__getitem__))
     given = RecordedPoses(poses, 0.1 * np.arange(SWEEPS), "given", np.zeros(3), 0.0, 0.0)
     first = Alignment.from_poses(given, 0.15, Motion.COMPENSATED, CHANNELS, recorded.lasers)
     alignment = align(recorded, first, np.arange(SWEEPS), set(range(SWEEPS)))
@@ -153,12 +153,12 @@ def test_a_twin_has_the_intensity_response_of_the_sensor(tmp_path):
     opened = open_recording(recorded_drive(city(5_000), recorder), name="drive")
 
     def read(number):
-        sweep = opened.read_fired(number)
+        sweep = opened.fired(number)
         time_s = 1e-9 * sweep.columns["time"]
         columns = {"ring": sweep.rings, "timestamp": time_s, "intensity": sweep.intensity}
         return Sweep(sweep.points, columns)
 
-    found = twin(Recording("drive", len(opened), read, energy_unit=1.0))
+    found = twin(made_recording("drive", len(opened), read, energy_unit=1.0))
     found.save(tmp_path / "twin")
     sensor = load_sensor(tmp_path / "twin" / "sensor.yaml")
     # On the ground, the incidence follows from the range, so they cannot be told apart exactly.

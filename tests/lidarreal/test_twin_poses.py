@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarreal.reconstruction.blocked_directions import BlockedDirections
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
@@ -53,7 +53,7 @@ def ring_points(rings=16, columns=180, radius_m=9.0):
 def recorded(stamps_s=None, poses=None, count=COUNT, **fields):
     """Return the sweeps of a sensor that always sees the same points around it."""
     points, ring = ring_points()
-    recording = Recording(
+    recording = made_recording(
         "drive",
         count,
         lambda _: Sweep(points, {"ring": ring}),
@@ -183,7 +183,7 @@ def test_registration_continues_where_sweeps_are_missing():
     numbers = np.array([0, 1, 2, 3, 4, 16, 17, 18])
     truth = np.stack([pose_of((0.5 * number, 0.1 * number, 0.0)) for number in numbers])
     stamps_s = 0.1 * numbers
-    recording = Recording(
+    recording = made_recording(
         "room",
         len(numbers),
         lambda number: Sweep(room_points(truth[number], number)),
@@ -202,7 +202,7 @@ def test_registration_finds_poses_from_the_first_sweep():
         points = room_points(truth[number], number)
         return Sweep(points[:60] if number == 5 else points)  # too few are not registered
 
-    sweeps = RecordedSweeps.from_recording(Recording("room", 8, read))
+    sweeps = RecordedSweeps.from_recording(made_recording("room", 8, read))
     found = find_poses(sweeps, None)
     registered = np.arange(8) != 5
     apart = np.abs(found.matrices - truth)
@@ -211,7 +211,7 @@ def test_registration_finds_poses_from_the_first_sweep():
     assert (found.source, found.are_given, found.share) == ("from registration", False, 0.5)
     # Equal poses of all sweeps are a default, unless they come from a simulation.
     still = np.tile(pose_of((5.0, 6.0, 7.0)), (8, 1, 1))
-    recording = Recording("room", 8, read, read_poses=lambda: still)
+    recording = made_recording("room", 8, read, read_poses=lambda: still)
     assert find_poses(RecordedSweeps.from_recording(recording), None).source == found.source
 
 

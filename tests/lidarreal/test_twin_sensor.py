@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.reconstruction import recorded_sensor
 from lidarreal.reconstruction.air_returns import AirStatistics, find_air_returns
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment
@@ -61,7 +61,7 @@ def recorded(clockwise=False, timed=True, count=5, stamps_s=None, kept=None):
     sweep = Sweep(points, columns).select(rows)
     stamps = None if stamps_s is None else (lambda: (1e9 * stamps_s).astype(np.int64))
     return RecordedSweeps.from_recording(
-        Recording("hall", count, lambda _: sweep, read_stamps=stamps)
+        made_recording("hall", count, lambda _: sweep, read_stamps=stamps)
     )
 
 
@@ -278,7 +278,7 @@ def test_snow_is_in_the_air_and_thin_poles_are_not():
         mask[chosen] = True
         flakes.append((range_m, mask))
     sweeps = RecordedSweeps.from_recording(
-        Recording(
+        made_recording(
             "snow", 11, lambda k: Sweep(flakes[k][0][:, None] * vectors, {"ring": RINGS - 1 - ring})
         )
     ).with_isolated_ranges()
@@ -331,8 +331,10 @@ def test_a_sensor_is_fitted_to_channels_from_the_lowest_ring_to_the_highest(monk
         chosen = np.array([1, 3])
         found, options = recorded_sensor._fit_to_sweeps(sweeps, chosen, None, response)
         energies = model is IntensityModel.ENERGIES
-        assert (found.energy_unit, options["white"]) == ((1.0, None) if energies else (None, 30))
-        assert found.count == 2
+        assert (found.info.energy_unit, options["white"]) == (
+            (1.0, None) if energies else (None, 30)
+        )
+        assert len(found) == 2
         one = found[1]
         assert one.columns["channel"].tolist() == [15, 13, 14]
         assert one.intensity.tolist() == ([1, 2, 0.5] if energies else [30, 60, 15])

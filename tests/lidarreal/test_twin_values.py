@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.reconstruction.alignment import AlignedSweep, Alignment
 from lidarreal.reconstruction.blocked_directions import PulseCounts
 from lidarreal.reconstruction.free_space import RangeImage, find_stationary_points, locate
@@ -644,7 +644,7 @@ def test_only_what_moves_with_the_sensor_is_the_vehicle(speed_m):
         order = np.lexsort((ring, column))
         return Sweep((range_m[:, None] * vectors)[order], {"ring": ring[order]})
 
-    recorded = RecordedSweeps.from_recording(Recording("street", 26, read))
+    recorded = RecordedSweeps.from_recording(made_recording("street", 26, read))
     poses = np.tile(np.eye(4), (26, 1, 1))
     poses[:, 0, 3] = speed_m * np.arange(26)
     given = RecordedPoses(poses, 0.1 * np.arange(26), "given", np.zeros(3))

@@ -61,8 +61,8 @@ def test_selected_points_keep_what_the_recording_found():
         calls.append(len(whole))
         return np.arange(10, 14)
 
-    recording = SimpleNamespace(rings_of=rings_of, times_of=lambda _: np.arange(4) / 10)
-    bare = Sweep(POINTS, {}, recording=recording)
+    facts = SimpleNamespace(rings_of=rings_of, times_of=lambda _: np.arange(4) / 10)
+    bare = Sweep(POINTS, {}, facts=facts)
     chosen = bare.returns().select([1])
     assert chosen.rings.tolist() == [12] and chosen.times_s.tolist() == [0.2]
     assert calls == [4]
@@ -73,11 +73,11 @@ def test_selected_points_keep_what_the_recording_found():
 
 def test_moved_points_keep_their_rings_and_times():
     """Rings that follow from elevation angles would be wrong in another frame."""
-    recording = SimpleNamespace(
+    facts = SimpleNamespace(
         rings_of=lambda sweep: np.nan_to_num(sweep.points[:, 0]).astype(int),
         times_of=lambda sweep: sweep.columns["t"],
     )
-    recorded = Sweep(POINTS, {"t": np.arange(4)}, recording=recording)
+    recorded = Sweep(POINTS, {"t": np.arange(4)}, facts=facts)
     moved = recorded.replace(points=POINTS + 5, columns={})
     assert moved.rings.tolist() == [1, 0, 0, 0] and moved.times_s.tolist() == [0, 1, 2, 3]
     assert moved.with_columns().rings is None

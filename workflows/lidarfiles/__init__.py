@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         ".clouds.open3d_cloud": "to_open3d",
         ".clouds.ply": "read_cloud",
-        ".clouds.recording": "Recording",
+        ".clouds.recording": "PointCloud Recording RecordingInfo SweepsInMemory",
         ".clouds.writing": "save_cloud",
         ".datasets.loader": "sweeps",
         ".recordings.opening": "open_recording",

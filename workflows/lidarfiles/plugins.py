@@ -11,7 +11,14 @@ from .clouds.cloud_format import CloudFormat
 from .clouds.format_row import FormatRow
 from .clouds.multi_file_format import MultiFileFormat
 from .clouds.point_field import PointField
-from .clouds.recording import Recording, RecordingSource
+from .clouds.recording import (
+    FileRecording,
+    PointCloud,
+    Recording,
+    RecordingInfo,
+    SweepsInMemory,
+)
+from .clouds.recording_ref import RecordingRef
 from .clouds.writing import ExportSpec
 
 __all__ = [
@@ -19,11 +26,15 @@ __all__ = [
     "CloudFormat",
     "CloudLike",
     "ExportSpec",
+    "FileRecording",
     "FormatRow",
     "MultiFileFormat",
+    "PointCloud",
     "PointField",
     "Recording",
-    "RecordingSource",
+    "RecordingInfo",
+    "RecordingRef",
     "Sweep",
     "Sweeps",
+    "SweepsInMemory",
 ]

@@ -6,7 +6,10 @@ from lidarsim.environment.lazy_names import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "lidarfiles": "Recording open_recording read_cloud save_cloud sweeps to_open3d",
+        "lidarfiles": (
+            "PointCloud Recording RecordingInfo SweepsInMemory open_recording read_cloud "
+            "save_cloud sweeps to_open3d"
+        ),
         "lidarlive": "Foxglove Rerun play",
         "lidarreal": (
             "Augment Comparison Effects Fit Insertion PatternFit SurveyComparison Twin "

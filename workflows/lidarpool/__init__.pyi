@@ -1,4 +1,7 @@
+from lidarfiles import PointCloud as PointCloud
 from lidarfiles import Recording as Recording
+from lidarfiles import RecordingInfo as RecordingInfo
+from lidarfiles import SweepsInMemory as SweepsInMemory
 from lidarfiles import open_recording as open_recording
 from lidarfiles import read_cloud as read_cloud
 from lidarfiles import save_cloud as save_cloud
@@ -100,8 +103,10 @@ __all__ = [
     "PatternFit",
     "Plan",
     "Planning",
+    "PointCloud",
     "Pose",
     "Recording",
+    "RecordingInfo",
     "Rerun",
     "Result",
     "Returns",
@@ -117,6 +122,7 @@ __all__ = [
     "Survey",
     "SurveyComparison",
     "Sweep",
+    "SweepsInMemory",
     "Track",
     "Twin",
     "__version__",

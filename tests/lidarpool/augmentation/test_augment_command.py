@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
 from lidarfiles import open_recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarpool.cli.commands import cli
 from lidarreal.augmentation.insertions import load_insertion
 from lidarreal.augmentation.rewriting.opening import open_rewriter
@@ -248,7 +249,7 @@ def test_folders_of_results_name_their_recordings(run, drive, tmp_path):
     result = run(folder, "--out", tmp_path / "out", "--rain", 5, fails=True)
     assert str(result.exception) == f"{folder} contains no sweeps. {remedy}"
     with pytest.raises(LidarError) as error:
-        open_rewriter(folder, open_recording(drive))
+        open_rewriter(RecordingRef(folder), open_recording(drive))
     assert str(error.value) == f"{folder} cannot be rewritten in PLY. {remedy}"
 
 

@@ -1,14 +1,14 @@
 """Effects on recorded sweeps, compared with the same effects on cast rays."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
+from tests.made_recordings import changed_recording, made_recording
 from tests.simulated_drives import simulated_drive
 
 from lidarfiles import open_recording
-from lidarfiles.clouds.recording import Recording
+from lidarreal import augment
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.insertions import load_insertion
@@ -66,7 +66,7 @@ def recording_of(clouds, **fields):
 
     stamps_ns = 1e8 * np.arange(len(clouds))
     options = {"energy_unit": 1.0, "read_stamps": lambda: stamps_ns, "compensated": False}
-    return Recording("drive", len(clouds), read, **options | fields)
+    return made_recording("drive", len(clouds), read, **options | fields)
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +289,7 @@ def test_a_stationary_car_keeps_its_place_while_the_sensor_moves(scene, sensor):
 @pytest.mark.parametrize("is_stamped", [True, False])
 def test_cars_move_during_a_sweep(clear, sensor, is_stamped):
     """Sweeps without timestamps last as long as a revolution of the sensor."""
-    clear = clear if is_stamped else replace(clear, read_stamps=None)
+    clear = clear if is_stamped else changed_recording(clear, read_stamps=None)
     speed = 20.0
     track = Track([0.0, 1.0], [[10, -3, -HEIGHT_M], [10 + speed, -3, -HEIGHT_M]], yaw_deg=0.0)
     augmenter = Augmenter(clear, Effects(actors=(Actor(CAR, track),)), sensor)
@@ -324,7 +324,7 @@ def test_pulses_without_a_return_are_no_points(clear, sensor, marker):
     """Organized sweeps contain them, in other rows than the returns."""
 
     def read(number):
-        sweep = clear.read(number)
+        sweep = clear.load(number)
         rows = np.arange(len(sweep)).repeat(1 + (np.arange(len(sweep)) % 5 == 0))
         is_lost = np.append(False, np.diff(rows) == 0)
         organized = sweep.select(rows)
@@ -332,7 +332,7 @@ def test_pulses_without_a_return_are_no_points(clear, sensor, marker):
         points[is_lost] = marker
         return organized.replace(points=points)
 
-    organized = replace(clear, read=read)
+    organized = changed_recording(clear, read=read)
     effects = Effects(weather=Weather(snow_mm_h=3.0))
     expected = Augmenter(clear, effects, sensor).sweep(0)
     result = Augmenter(organized, effects, sensor).sweep(0)
@@ -345,10 +345,10 @@ def test_pulses_without_a_return_are_no_points(clear, sensor, marker):
 
 def test_constant_times_are_kept(clear, sensor):
     def read(number):
-        sweep = clear.read(number)
+        sweep = clear.load(number)
         return sweep.replace(columns={**sweep.columns, "time": np.full(len(sweep), 7.0)})
 
-    constant = replace(clear, read=read, read_stamps=None)
+    constant = changed_recording(clear, read=read, read_stamps=None)
     result = Augmenter(constant, Effects(weather=Weather(visibility_km=0.1)), sensor).sweep(0)
     assert (~result.is_recorded).any()
     assert (result.sweep.columns["time"] == 7).all()
@@ -386,11 +386,11 @@ def test_a_car_keeps_its_place_far_away_while_the_sensor_turns(scene, sensor):
 
 def test_later_sweeps_without_intensities_are_named(clear, sensor):
     def read(number):
-        sweep = clear.read(number % len(clear))
+        sweep = clear.load(number % len(clear))
         names = {*sweep.columns} - ({"intensity", "reflectivity"} if number == 2 else set())
         return sweep.replace(columns={name: sweep.columns[name] for name in names})
 
-    mix = Recording("mix", 21, read)
+    mix = made_recording("mix", 21, read)
     augmenter = Augmenter(mix, Effects(weather=Weather(rain_mm_h=5)), sensor)
     with pytest.raises(
         LidarError, match=r"Unlike other sweeps, sweep 2 in mix has no column '\w+', "
@@ -416,13 +416,13 @@ def test_objects_around_the_sensor_are_noted(clear, sensor, x_m, z_m, relation):
 
 def test_unknown_rings_are_noted(clear, sensor):
     def without_rings(number):
-        sweep = clear.read(number)
+        sweep = clear.load(number)
         rows = np.random.default_rng(number).permutation(len(sweep))
         columns = {"intensity": sweep.columns["intensity"][rows]}
         noise = 0.02 * np.random.default_rng(number).normal(size=(len(rows), 3))
         return Sweep(sweep.points[rows] + noise, columns)
 
-    recording = Recording("drive", SWEEPS, without_rings, energy_unit=1.0)
+    recording = made_recording("drive", SWEEPS, without_rings, energy_unit=1.0)
     augmenter = Augmenter(recording, Effects(weather=Weather(visibility_km=0.1)), sensor)
     assert any("pulses without a return are unknown" in note for note in augmenter.notes)
     result = augmenter.sweep(0)
@@ -437,10 +437,13 @@ def test_faults_of_timestamps_are_refused(kind, clear, sensor):
         Augmenter(clear, Effects(faults=(fault,)), sensor)
 
 
-def test_a_cloud_without_sweeps_is_refused(sensor):
-    cloud = Recording("cloud.ply", 1, partial(Sweep, np.zeros((0, 3))), is_cloud=True)
-    with pytest.raises(LidarError, match="contains no sweeps"):
-        Augmenter(cloud, Effects(), sensor)
+def test_clouds_and_recordings_without_sweeps_are_refused(tmp_path, sensor):
+    with pytest.raises(LidarError, match="empty contains no sweeps"):
+        Augmenter(made_recording("empty", 0, None), Effects(), sensor)
+    (tmp_path / "cloud.xyz").write_text("1 2 3\n")
+    for cloud in (tmp_path / "cloud.xyz", open_recording(tmp_path / "cloud.xyz")):
+        with pytest.raises(LidarError, match=r"cloud\.xyz contains no sweeps"):
+            augment(cloud)
 
 
 def test_a_sweep_without_points_stays_empty(scene, sensor):
@@ -448,9 +451,9 @@ def test_a_sweep_without_points_stays_empty(scene, sensor):
     full = recording_of(clouds)
 
     def read(number):
-        return full.read(number) if number else full.read(0).select(slice(0))
+        return full.load(number) if number else full.load(0).select(slice(0))
 
-    recording = replace(full, read=read)
+    recording = changed_recording(full, read=read)
     result = Augmenter(recording, Effects(weather=Weather(snow_mm_h=2.0)), sensor).sweep(0)
     assert len(result.sweep) == 0
     assert result.sweep.columns["cause"].shape == (0,)
@@ -521,17 +524,17 @@ def test_a_model_with_fewer_channels_is_refused(clear):
 
 def test_classes_have_the_numbers_of_the_recording(clear, sensor):
     def read(number):
-        sweep = clear.read(number)
+        sweep = clear.load(number)
         return sweep.replace(columns={**sweep.columns, "class": np.zeros(len(sweep), np.uint16)})
 
-    named = replace(clear, read=read, read_classes=lambda: {10: "car", 40: "road"})
+    named = changed_recording(clear, read=read, read_classes=lambda: {10: "car", 40: "road"})
     car = Effects(insertions=(Insertion(CAR, 12, -3, class_name="car"),))
     result = Augmenter(named, car, sensor).sweep(0)
     assert {*result.sweep.columns["class"][~result.is_recorded].tolist()} == {10}
     lorry = Effects(insertions=(Insertion(CAR, 12, -3, class_name="lorry"),))
     with pytest.raises(LidarError, match="Unknown class 'lorry'"):
         Augmenter(named, lorry, sensor)
-    unnamed = replace(clear, read=read)
+    unnamed = changed_recording(clear, read=read)
     notes = Augmenter(unnamed, car, sensor).notes
     assert any("does not state the numbers of its classes" in note for note in notes)
 
@@ -565,10 +568,10 @@ def test_objects_of_the_same_shape_are_numbered(clear, sensor):
     """Two pedestrians, a third with a name, and an actor whose name the second would have."""
 
     def read(number):
-        sweep = clear.read(number)
+        sweep = clear.load(number)
         return sweep.replace(columns={**sweep.columns, "class": np.zeros(len(sweep), np.uint16)})
 
-    named = replace(clear, read=read, read_classes=lambda: SEMANTIC_KITTI)
+    named = changed_recording(clear, read=read, read_classes=lambda: SEMANTIC_KITTI)
     places = [(6.0, -3.0), (7.0, 4.0), (-5.0, 5.0)]
     people = tuple(
         Insertion(load_insertion("pedestrian"), x, y, class_name="pedestrian", name=name)

@@ -25,8 +25,9 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.ros.messages import message_store
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, open_ref
 from lidarreal.augmentation.rewriting import bag_rewriter
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarsim import LidarError
@@ -36,7 +37,8 @@ TOPIC = "/front/points"
 
 
 def opened(path, sensor=TOPIC):
-    return open_rewriter(path, open_recording(path, sensor, keep_noise=True), sensor)
+    ref = RecordingRef(path, sensor, keep_noise=True)
+    return open_rewriter(ref, open_ref(ref))
 
 
 def messages(path, skipped=()):
@@ -69,7 +71,7 @@ def test_identity_keeps_all_messages(written, tmp_path, name):
     assert notes == [
         f"Only the sweeps of {TOPIC} were augmented. /rear_left/points in {path} is unchanged."
     ]
-    assert open_recording(new, TOPIC).compensated is False  # custom data of the bag
+    assert open_recording(new, TOPIC).info.compensated is False  # custom data of the bag
     assert before == (content(path) if path.is_dir() else path.read_bytes())
 
 

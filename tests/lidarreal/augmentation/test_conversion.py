@@ -11,18 +11,19 @@ import pytest
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarfiles import read_cloud
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, open_ref
 from lidarreal.augmentation.augmented_sweep import AugmentedSweep
-from lidarreal.augmentation.conversion import open_converter
+from lidarreal.augmentation.conversion import FormatConverter
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarsim import LidarError
 
 
 def converter(path, spec, sensor=None):
     spec = ExportSpec(spec) if isinstance(spec, str) else spec
-    recording = open_recording(path, sensor, keep_noise=True)
-    return open_converter(path, recording, spec, sensor)
+    ref = RecordingRef(path, sensor, keep_noise=True)
+    return FormatConverter(ref, open_ref(ref), spec)
 
 
 def same_points(recording, expected, scale=1.0, atol=1e-4):
@@ -110,8 +111,8 @@ def test_bare_points_to_bags(tmp_path, layout):
     assert "has no timestamps, so its sweeps are assumed to be 0.1 s apart." in text
     assert "has no column object, which MCAP requires. It is -1 for all points." in text
     recording = open_recording(tmp_path / "new.mcap", "/points", keep_noise=True)
-    assert recording.compensated is None  # as in the recording
-    assert recording.energy_unit is None  # the scale of the recording is unknown
+    assert recording.info.compensated is None  # as in the recording
+    assert recording.info.energy_unit is None  # the scale of the recording is unknown
     np.testing.assert_allclose(np.diff(recording.stamps_ns), 1e8)
     for number in range(2):
         expected = changed(made.recording, number).sweep.points
@@ -171,8 +172,8 @@ def test_other_processes_receive_rewriters(written, name):
     path = written(name)
     if name == "pcd":
         path = path / "000000.pcd"
-    recording = open_recording(path, sensor, keep_noise=True)
-    for made in (open_rewriter(path, recording, sensor), converter(path, "ply", sensor)):
+    ref = RecordingRef(path, sensor, keep_noise=True)
+    for made in (open_rewriter(ref, open_ref(ref)), converter(path, "ply", sensor)):
         expected = made.sweep_files(0, changed(made.recording, 0))
         copy = cloudpickle.loads(cloudpickle.dumps(made))
         assert copy.sweep_files(0, changed(copy.recording, 0)) == expected

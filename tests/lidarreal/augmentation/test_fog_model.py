@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects
 from lidarsim import Material, Noise, Pose, Scanner, Scene, Survey, load_sensor
@@ -92,7 +92,7 @@ def recording(sensor):
     cloud = scanner.sweep(Pose((0, 0, 0)))
     columns = {name: cloud[name] for name in ("channel", "intensity")}
     sweep = Sweep(np.asarray(cloud.positions, np.float64), columns)
-    return Recording("box", 1, lambda _: sweep, energy_unit=1.0)
+    return made_recording("box", 1, lambda _: sweep, energy_unit=1.0)
 
 
 def augment(recording, sensor, visibility_km):

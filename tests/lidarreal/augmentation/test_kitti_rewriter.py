@@ -20,8 +20,9 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, open_ref
 from lidarreal.augmentation.augmented_sweep import AugmentedSweep
 from lidarreal.augmentation.rewriting.kitti_labels import KittiCamera
 from lidarreal.augmentation.rewriting.opening import open_rewriter
@@ -40,8 +41,8 @@ def drive(tmp_path_factory):
 
 
 def opened(path, sensor=None):
-    recording = open_recording(path, sensor, keep_noise=True)
-    return open_rewriter(path, recording, sensor)
+    ref = RecordingRef(path, sensor, keep_noise=True)
+    return open_rewriter(ref, open_ref(ref))
 
 
 def rows_of(path):
@@ -437,6 +438,6 @@ def test_links_in_the_source(drive, tmp_path):
 
 def test_other_formats_are_refused(tmp_path):
     (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n")
-    recording = open_recording(tmp_path / "a.xyz", keep_noise=True)
+    ref = RecordingRef(tmp_path / "a.xyz")
     with pytest.raises(LidarError, match=r"Choose another format with `--format`"):
-        open_rewriter(tmp_path / "a.xyz", recording)
+        open_rewriter(ref, open_ref(ref))

@@ -19,8 +19,9 @@ from tests.fake_augmenters import (
     write_sweep,
 )
 
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, open_ref
 from lidarreal.augmentation.rewriting.nuscenes_categories import visibility_token
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarsim import LidarError
@@ -50,7 +51,8 @@ def write_drive(path, classes):
 
 
 def opened(path, sensor="LIDAR_TOP"):
-    return open_rewriter(path, open_recording(path, sensor, keep_noise=True), sensor)
+    ref = RecordingRef(path, sensor, keep_noise=True)
+    return open_rewriter(ref, open_ref(ref))
 
 
 def tables_of(path):

@@ -11,8 +11,9 @@ from hypothesis.extra.numpy import arrays
 from tests.drives import points_of, the_scene, the_sweeps
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_ref
 from lidarreal.augmentation.rewriting.opening import open_rewriter
 from lidarreal.augmentation.rewriting.stored_records import StoredRecords, convert_values
 from lidarsim.columns.sweep import Sweep
@@ -70,7 +71,8 @@ def write(path, kind, rows, height=1):
 
 
 def opened(path, **options):
-    return open_rewriter(path, open_recording(path, keep_noise=True, **options))
+    ref = RecordingRef(path, keep_noise=True, **options)
+    return open_rewriter(ref, open_ref(ref))
 
 
 KINDS = ("ascii", "binary", "binary_compressed")

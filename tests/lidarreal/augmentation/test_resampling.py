@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.made_recordings import changed_recording, made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.resampling import SensorResampler
 from lidarreal.augmentation.ring_directions import RingDirections
 from lidarsim import LidarError, Sensor, load_sensor
@@ -42,7 +42,7 @@ def scan_room(sensor):
 
 
 def recording(sweep, name="drive"):
-    return Recording(name, 1, lambda _: sweep)
+    return made_recording(name, 1, lambda _: sweep)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_rings_without_a_return_are_not_replaced_by_their_neighbors(dense, eleva
     ring = dense.columns["channel"]
     is_lost = np.isin(ring, [6, 7, 20])
     sweeps = [blurred, dense, dense.select(~is_lost)]
-    resampler = SensorResampler(Recording("drive", 3, lambda number: sweeps[number]), SPARSE)
+    resampler = SensorResampler(made_recording("drive", 3, lambda number: sweeps[number]), SPARSE)
     complete = resampler.sweep(1).template
     assert len(complete) == 240 * 16 and is_lost[complete].sum() == 240 * 2
     remaining = np.flatnonzero(~is_lost)[resampler.sweep(2).template]
@@ -199,7 +199,7 @@ def test_elevations_of_tilted_rings_depend_on_the_azimuth(dense):
 
 def test_compensated_results_use_the_directions_as_fired(dense):
     moved = dense.points + np.linspace(0, 0.5, len(dense))[:, None] * [1, 0, 0]
-    compensated = Recording(
+    compensated = made_recording(
         "drive", 1, lambda _: dense.replace(points=moved), compensated=True, fired=lambda _: dense
     )
     augmented = SensorResampler(compensated, SPARSE).sweep(0)
@@ -343,7 +343,7 @@ def test_recordings_without_rings_or_sweeps_are_refused(dense):
     with pytest.raises(LidarError, match=r"drive has no ring column, .* Without rings, its sweeps"):
         SensorResampler(recording(tilted), SPARSE)
     with pytest.raises(LidarError, match="drive contains no sweeps"):
-        SensorResampler(replace(recording(dense), is_cloud=True), SPARSE)
+        SensorResampler(changed_recording(recording(dense), count=0), SPARSE)
 
 
 def test_notes_state_the_accuracy_and_the_range(dense):
@@ -357,5 +357,5 @@ def test_notes_state_the_accuracy_and_the_range(dense):
 
 def test_an_empty_sweep_stays_empty(dense):
     sweeps = [dense, dense.select(slice(0))]
-    two = Recording("drive", 2, lambda number: sweeps[number])
+    two = made_recording("drive", 2, lambda number: sweeps[number])
     assert not len(SensorResampler(two, SPARSE).sweep(1).sweep)

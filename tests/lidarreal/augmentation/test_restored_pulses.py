@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.augmenter import Augmenter
 from lidarreal.augmentation.effects import Effects
 from lidarreal.augmentation.scan_pattern import ScanPattern
@@ -49,7 +49,7 @@ def recording_of(clouds, *, compensated=False):
         columns = {name: cloud[name] for name in ("channel", "intensity")}
         return Sweep(points, {**columns, "time": time_s}, pose=poses[number])
 
-    return Recording(
+    return made_recording(
         "drive",
         SWEEPS,
         read,
@@ -129,5 +129,5 @@ def test_the_maximum_range_is_that_of_all_sweeps(farthest):
     points[7] = [-48, 0, -14]
     sweeps = [Sweep(points[8:])] * SWEEPS
     sweeps[farthest] = Sweep(points)
-    pattern = ScanPattern.from_recording(Recording("drive", SWEEPS, sweeps.__getitem__))
+    pattern = ScanPattern.from_recording(made_recording("drive", SWEEPS, sweeps.__getitem__))
     assert pattern.max_range_m == pytest.approx(50)

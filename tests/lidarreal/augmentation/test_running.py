@@ -16,10 +16,11 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 
 import poolpart.deploy
 from lidarfiles import open_recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.work.work import FOLDER, Work
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.running import WORK_SUFFIX, Augmentation
-from lidarreal.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
+from lidarreal.augmentation.sweep_tasks import unchanged_sweep
 from lidarreal.augmentation.variants import CampaignVariants, Variants
 from lidarsim import LidarError, box, load_sensor
 from lidarsim.io.storage import Storage
@@ -42,7 +43,7 @@ from pathlib import Path
 from lidarreal.augmentation import running
 from lidarreal.augmentation.effects import Effects
 from lidarreal.augmentation.running import Augmentation
-from lidarreal.augmentation.sweep_tasks import RecordingFile
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarreal.augmentation.variants import Variants
 
 def pause(done, total):
@@ -50,7 +51,7 @@ def pause(done, total):
     time.sleep(0.2)
 
 effects = Effects.load(options={"weather": {"rain_mm_h": 50, "visibility_km": 0.2}})
-augmentation = Augmentation(RecordingFile(Path(sys.argv[1])), Variants(effects))
+augmentation = Augmentation(RecordingRef(Path(sys.argv[1])), Variants(effects))
 augmentation.run(Path(sys.argv[2]), workers=1, progress=pause)
 """
 
@@ -67,7 +68,7 @@ def drive(points, tmp_path):
 
 @pytest.fixture
 def augmentation(drive):
-    return Augmentation(RecordingFile(drive), Variants(Effects.load(options=RAIN)))
+    return Augmentation(RecordingRef(drive), Variants(Effects.load(options=RAIN)))
 
 
 def content(folder):
@@ -324,9 +325,9 @@ def test_unchanged_sweeps_have_the_cause_of_surfaces(drive):
 def test_a_single_file_keeps_its_name(points, tmp_path):
     (path,) = write_pcd_drive(tmp_path / "drive", points[:1]).iterdir()
     variants = Variants(Effects.load(options=RAIN))
-    into = Augmentation(RecordingFile(path), variants).run(tmp_path / "wet", workers=1)
+    into = Augmentation(RecordingRef(path), variants).run(tmp_path / "wet", workers=1)
     assert into.outputs == (tmp_path / "wet" / path.name,)
-    other = Augmentation(RecordingFile(path), variants).run(tmp_path / "wet.pcd", workers=1)
+    other = Augmentation(RecordingRef(path), variants).run(tmp_path / "wet.pcd", workers=1)
     assert other.outputs == (tmp_path / "wet.pcd",)
     assert into.outputs[0].read_bytes() == other.outputs[0].read_bytes()
 
@@ -375,7 +376,7 @@ def kitti(points, tmp_path):
 
 @pytest.mark.extended
 def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
-    everything = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
+    everything = Augmentation(RecordingRef(kitti), Variants(Effects.load(options=RAIN)))
     augmented = everything.run(tmp_path / "all", workers=1)
     assert augmented.sweeps == 4
     assert any(note.startswith("00: ") for note in augmented.notes)
@@ -404,7 +405,7 @@ def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
 def test_messages_name_one_of_several_sensors(kitti, tmp_path):
     for path in kitti.glob("sequences/01/velodyne/*.bin"):
         path.write_bytes(b"")
-    several = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
+    several = Augmentation(RecordingRef(kitti), Variants(Effects.load(options=RAIN)))
     with pytest.raises(LidarError) as refused:
         several.run(tmp_path / "wet", workers=1)
     assert "01" in str(refused.value)
@@ -413,13 +414,13 @@ def test_messages_name_one_of_several_sensors(kitti, tmp_path):
 
 def test_insertions_into_several_sequences(kitti, tmp_path):
     crate = Variants(Effects(insertions=(Insertion(box("crate", (1, 1, 1)), 6, -3),)))
-    augmented = Augmentation(RecordingFile(kitti), crate).run(tmp_path / "crate", workers=1)
+    augmented = Augmentation(RecordingRef(kitti), crate).run(tmp_path / "crate", workers=1)
     assert augmented.counts.added["surface"] > 50
 
 
 def test_one_of_several_sensors_is_converted(kitti, tmp_path):
     augmentation = Augmentation(
-        RecordingFile(kitti), Variants(Effects.load(options=RAIN)), output_format="pcd"
+        RecordingRef(kitti), Variants(Effects.load(options=RAIN)), output_format="pcd"
     )
     with pytest.raises(LidarError, match="Choose it with `--topic`"):
         augmentation.run(tmp_path / "wet", workers=1)
@@ -433,7 +434,7 @@ def test_one_of_several_sensors_is_converted(kitti, tmp_path):
 @pytest.mark.extended
 def test_recordings_are_converted(drive, tmp_path):
     wet = Variants(Effects.load(options=RAIN))
-    augmentation = Augmentation(RecordingFile(drive), wet, output_format="mcap")
+    augmentation = Augmentation(RecordingRef(drive), wet, output_format="mcap")
     augmented = augmentation.run(tmp_path / "into", workers=1)
     assert augmented.outputs == (tmp_path / "into" / "drive.mcap",)
     assert len(open_recording(augmented.outputs[0])) == SWEEPS
@@ -543,5 +544,5 @@ def test_two_runs_do_not_share_an_output(augmentation, drive, tmp_path):
 def test_missing_recordings_are_reported(tmp_path):
     variants = Variants(Effects.load(options=RAIN))
     with pytest.raises(LidarError, match=r"nowhere does not exist"):
-        Augmentation(RecordingFile(tmp_path / "nowhere"), variants).run(tmp_path / "out")
+        Augmentation(RecordingRef(tmp_path / "nowhere"), variants).run(tmp_path / "out")
     assert not [*tmp_path.iterdir()]

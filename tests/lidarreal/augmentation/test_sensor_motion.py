@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.effects import Effects, Insertion
 from lidarreal.augmentation.ground_plane import GroundPlane
 from lidarreal.augmentation.inserted_objects import InsertedObjects
@@ -55,7 +55,7 @@ def drive(compensated, origin, *motion):
         ring = np.arange(POINTS, dtype=np.uint16) % 4
         return Sweep(points, {"time": times_s, "channel": ring, "intensity": ring + 1.0})
 
-    recording = Recording(
+    recording = made_recording(
         "drive",
         len(STAMPS_S),
         read,
@@ -138,7 +138,7 @@ def test_the_ground_is_a_plane_around_the_object(slope_x, slope_y, x_m, y_m):
 def test_objects_are_inclined_like_the_ground(heading_deg):
     """The second object has a height, so it is level."""
     slope_x, slope_y = 0.06, -0.03
-    recording = Recording("drive", 1, lambda _: ground(slope_x, slope_y))
+    recording = made_recording("drive", 1, lambda _: ground(slope_x, slope_y))
     car = box("Car", (4.5, 1.8, 1.5))
     raised = replace(
         car, vertices=np.add(car.vertices, [0, 0, 0.3])

@@ -6,9 +6,9 @@ import pickle
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 from tests.street_recordings import record, reflectances
 
-from lidarfiles.clouds.recording import Recording
 from lidarreal.augmentation.detection_threshold import detection_threshold
 from lidarreal.augmentation.intensity_scale import IntensityScale
 from lidarreal.augmentation.strength_columns import StrengthColumns
@@ -180,7 +180,7 @@ def test_weak_returns_have_the_energies_of_the_column_with_the_finest_steps():
     reflectivity = OUSTER.encode(energy / (10 / range_m) ** 2)
     columns = {"intensity": signal, "reflectivity": reflectivity}
     points = np.outer(range_m, [1.0, 0, 0])
-    recording = Recording("drive", 1, lambda _: Sweep(points, columns))
+    recording = made_recording("drive", 1, lambda _: Sweep(points, columns))
     strengths = StrengthColumns.for_recording(recording, load_sensor("ouster/os1-64"))
     assert strengths.scale.column == "reflectivity"
     weak = (reflectivity < 8) & (signal > 30)
@@ -198,7 +198,7 @@ def test_saturated_returns_are_clipped():
     reflectivity = random.integers(5, 90, len(range_m)).astype(np.uint8)
     points = np.outer(range_m, [1.0, 0, 0])
     columns = {"reflectivity": reflectivity}
-    recording = Recording("drive", 1, lambda _: Sweep(points, columns))
+    recording = made_recording("drive", 1, lambda _: Sweep(points, columns))
     strengths = StrengthColumns.for_recording(recording, load_sensor("ouster/os1-64"))
     energy = strengths.energies(columns, range_m)
     full = float(np.median(energy))

@@ -6,9 +6,10 @@ import pickle
 
 import numpy as np
 import pytest
+from tests.made_recordings import made_recording
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
-from lidarfiles import Recording, open_recording
+from lidarfiles import open_recording
 from lidarfiles.clouds.boxes import SweepBoxes
 from lidarreal import Augment, Effects, Insertion, augment
 from lidarreal.augmentation.augmenter import Augmenter
@@ -91,7 +92,7 @@ def test_boxes_of_recorded_and_inserted_objects(drive):
         np.array([17]),
     )
     opened = open_recording(drive)
-    recording = Recording("drive", 1, lambda number: opened[0].replace(boxes=recorded))
+    recording = made_recording("drive", 1, lambda number: opened[0].replace(boxes=recorded))
     crate = Insertion(box("crate", (1, 1, 1)), 6, -3)
     (sweep,) = augment(recording, Effects(insertions=(crate,)))
     assert sweep.boxes.names == ("Car 1", "crate")
@@ -239,7 +240,7 @@ def test_sweeps_without_returns_are_unchanged(drive, with_reference):
 
 
 def test_errors_name_arguments_instead_of_options(points):
-    recording = Recording("drive", 1, lambda _: Sweep(points[0][:, :3]))
+    recording = made_recording("drive", 1, lambda _: Sweep(points[0][:, :3]))
     remedy = "or pass `reflectance=0.3` to assume the same reflectance for all returns."
     with pytest.raises(LidarError) as error:
         Augment(columns=(), **RAIN)(points[0][:, :3])

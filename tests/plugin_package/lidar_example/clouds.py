@@ -4,16 +4,13 @@ import io
 
 import numpy as np
 
-from lidarpool.plugins import Cloud, FormatRow, MultiFileFormat, Recording, RecordingSource, Sweep
+from lidarpool.plugins import Cloud, FileRecording, FormatRow, MultiFileFormat, RecordingRef, Sweep
 
 
 class SweepFolder(MultiFileFormat):
     """A folder with one file per sweep, which the workers of a cluster write."""
 
-    row = FormatRow(
-        "npy",  # name of the folder in a result
-        folders=("[0-9]*.npy",),  # files in folders that the format opens
-    )
+    row = FormatRow("npy", folders=("[0-9]*.npy",))  # folder in a result, and files to open
     by_sweep = True
     other_columns = False
     file_pattern = r"\d+\.npy"
@@ -25,9 +22,14 @@ class SweepFolder(MultiFileFormat):
         return {f"{number:06}.npy": file.getvalue()}, None
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open the files in a folder as sweeps, with positions in world coordinates."""
-        files = sorted(source.path.glob("[0-9]*.npy"))
-        return source.recording(
-            len(files), lambda number: Sweep(np.load(files[number]), pose=np.eye(4))
-        )
+    def open(cls, ref: RecordingRef) -> FileRecording:
+        """Open the files in a folder as sweeps."""
+        return FolderRecording(ref.info(), sorted(ref.path.glob("[0-9]*.npy")))
+
+
+class FolderRecording(FileRecording):
+    """Sweeps with positions in world coordinates, each in a file."""
+
+    def load(self, number: int) -> Sweep:
+        """Read a sweep."""
+        return Sweep(np.load(self.paths[number]), pose=np.eye(4))

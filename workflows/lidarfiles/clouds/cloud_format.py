@@ -19,7 +19,8 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ..picture_file import PictureContent
 from .format_row import FormatRow
 from .point_field import PointField
-from .recording import Recording, RecordingSource
+from .recording import PointCloud, Recording
+from .recording_ref import RecordingRef
 
 if TYPE_CHECKING:
     from .job_reader import JobReader
@@ -221,12 +222,12 @@ class CloudFormat(ABC):
         return None
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a file or folder as a recording.
+    def open(cls, ref: RecordingRef) -> Recording | PointCloud:
+        """Open a file or folder as a recording, or as a cloud if it has no sweeps.
 
         Raises
         ------
         LidarError
             If it is damaged, or if the user must make a choice, for example of a sensor.
         """
-        raise LidarError(f"{source.name} is in a format that can be written, but not read.")
+        raise LidarError(f"{ref.name} is in a format that can be written, but not read.")

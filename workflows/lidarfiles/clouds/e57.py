@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
@@ -29,7 +30,8 @@ from ..processes.per_process import PerProcess
 from .cloud_format import CloudFormat
 from .gps_time import gps_start_s
 from .point_field import OMITTED, PointField
-from .recording import Recording, RecordingSource
+from .recording import Recording
+from .recording_ref import RecordingRef
 from .return_numbers import return_numbers
 from .well_known_text import wkt
 from .writing import ExportSpec
@@ -116,12 +118,13 @@ class E57(CloudFormat):
                 raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open the scans of an E57 file.
 
         Points are in the scanner frame, and each scan has a pose.
         """
-        return _open_e57(source)
+        with reading(ref.name):
+            return _E57Recording(ref)
 
 
 def _highest_intensity(cloud: CloudLike) -> float:
@@ -201,50 +204,56 @@ class _Scale(NamedTuple):
     notes: tuple[str, ...] = ()  # notes for the user, which continue the name of the file
 
 
-def _open_e57(source: RecordingSource) -> Recording:
-    import pye57
+class _E57Recording(Recording):
+    """The scans of an E57 file."""
 
-    with reading(source.name):
-        size = input_size(source.path)
-        files = PerProcess(lambda: (pye57.E57(str(source.path)), Lock()))
-        file, _ = files()
-        headers = [file.get_header(number) for number in range(file.scan_count)]
+    def __init__(self, ref: RecordingRef) -> None:
+        super().__init__(ref.info(is_metric=True))
+        self._size = input_size(ref.path)
+        self._files = PerProcess(partial(_open_file, ref.path))
+        file, _ = self._files()
+        self._headers = [file.get_header(number) for number in range(file.scan_count)]
         # A column of equal values takes no space in the file, regardless of the number of points.
-        total = Allowance(size, _THIN, in_parts=True)
-        for header in headers:
+        total = Allowance(self._size, _THIN, in_parts=True)
+        for header in self._headers:
             total.reserve(_bytes_of_scan(header))
-        scale = _scale(headers)
-
-        def read(number: int) -> Sweep:
-            Allowance(size, _THIN).reserve(_bytes_of_scan(headers[number]))
-            file, lock = files()
-            with lock:  # a file cannot have two readers
-                return _read_scan(file, file.get_header(number), number, scale)
-
-        notes = list(scale.notes)
-        for number, header in enumerate(headers):
+        self._scale = _scale(self._headers)
+        system = _system(file)
+        notes = list(self._scale.notes)
+        for number, header in enumerate(self._headers):
             _, pose_notes = _pose(header, _name(header, number))
             notes += pose_notes
         epsg = None
-        system = _system(file)
-        if system is not None and headers and not source.as_stored:
-            notes += check_metric_format(system, read(0).in_world())
+        if system is not None and self._headers and not ref.as_stored:
+            notes += check_metric_format(system, self.load(0).in_world())
             # E57 coordinates are in meters. They cannot be in a system that uses another unit.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
-        names = [_stated_name(header) for header in headers]
+        names = tuple(_stated_name(header) for header in self._headers)
         is_compensated = any(name.endswith(_MOVING) for name in names)
-        stations = [] if is_compensated else names
-    return source.recording(
-        len(headers),
-        read,
-        point_count=sum(h.point_count for h in headers) if source.as_stored else None,
-        notes=source.prefix_notes(notes),
-        system=system,
-        epsg=epsg,
-        is_metric=True,
-        stations=tuple(stations),
-        compensated=True if is_compensated else None,
-    )
+        self.info = ref.info(
+            point_count=sum(h.point_count for h in self._headers) if ref.as_stored else None,
+            compensated=True if is_compensated else None,
+            system=system,
+            epsg=epsg,
+            is_metric=True,
+            stations=() if is_compensated else names,
+            notes=ref.prefix_notes(notes),
+        )
+
+    def __len__(self) -> int:
+        return len(self._headers)
+
+    def load(self, number: int) -> Sweep:
+        Allowance(self._size, _THIN).reserve(_bytes_of_scan(self._headers[number]))
+        file, lock = self._files()
+        with lock:  # a file cannot have two readers
+            return _read_scan(file, file.get_header(number), number, self._scale)
+
+
+def _open_file(path: Path) -> tuple[Any, Lock]:
+    import pye57
+
+    return pye57.E57(str(path)), Lock()
 
 
 def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:

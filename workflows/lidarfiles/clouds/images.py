@@ -29,7 +29,8 @@ from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat
 from .point_field import PointField
-from .recording import Recording, RecordingSource
+from .recording import FileRecording, Recording
+from .recording_ref import RecordingRef
 
 _NO_IMAGES = ("pose", "scan", "frame")  # arrays in a file that are not images
 
@@ -112,11 +113,14 @@ class ImageFolder(MultiFileFormat):
             return points_of_images(images)
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open the range images in a folder with one subfolder per sensor."""
-        with reading(source.name):
-            sensors = _sensors(source)
-        return source.select_sensor(sensors)
+        with reading(ref.name):
+            sensors = _files_of_sensors(ref.path)
+        name, files = ref.choose_sensor(sensors)
+        with reading(ref.name), open_archive(files[0], partial(read_input, files[0])) as images:
+            compensated = _stated_compensation(images)
+        return _ImageRecording(ref.info(sensor=name, compensated=compensated), files)
 
 
 def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
@@ -148,27 +152,26 @@ def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
     return f"{folders[sweeps.sensor[sweep]]}/{sweeps.numbers[sweep]:06}.npz"
 
 
-def _sensors(source: RecordingSource) -> dict[str, Recording]:
-    """Open the range images of each sensor, keyed by sensor name."""
+def _files_of_sensors(folder: Path) -> dict[str, list[Path]]:
+    """Return the files of the range images of each sensor, keyed by sensor name."""
     files_of_sensor = {
         inner.name: sort_by_number(inner.glob("*.npz"))
-        for inner in sorted(source.path.iterdir())
+        for inner in sorted(folder.iterdir())
         if inner.is_dir()
     }
+    return {sensor: files for sensor, files in files_of_sensor.items() if files}
 
-    def recording(files: list[Path]) -> Recording:
-        def read(number: int) -> Sweep:
-            with open_archive(files[number], partial(read_input, files[number])) as images:
-                pose = images["pose"]
-                compensated = _stated_compensation(images)
-                points, columns = points_of_images(images)
-            return Sweep(points, columns, pose=pose, compensated=compensated)
 
-        with open_archive(files[0], partial(read_input, files[0])) as images:
+class _ImageRecording(FileRecording):
+    """Range images of one sensor."""
+
+    def load(self, number: int) -> Sweep:
+        file = self.paths[number]
+        with open_archive(file, partial(read_input, file)) as images:
+            pose = images["pose"]
             compensated = _stated_compensation(images)
-        return source.recording(len(files), read, compensated=compensated)
-
-    return {sensor: recording(files) for sensor, files in files_of_sensor.items() if files}
+            points, columns = points_of_images(images)
+        return Sweep(points, columns, pose=pose, compensated=compensated)
 
 
 def _stated_compensation(images: Mapping[str, AnyArray]) -> bool | None:

@@ -6,7 +6,6 @@ import io
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,7 +39,9 @@ from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes, as_npy
 from .point_field import OMITTED, PointField
-from .recording import Recording, RecordingSource, sweep_from_columns
+from .recorded_boxes import RecordedBoxes
+from .recording import FileRecording, Recording, RecordingInfo, sweep_from_columns
+from .recording_ref import RecordingRef
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
@@ -223,15 +224,14 @@ class KITTI(MultiFileFormat):
         return rows[:, :3], {"intensity": rows[:, 3], "class": classes, "object": instances}
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open a KITTI or nuScenes .bin file, or a KITTI or SemanticKITTI sequence."""
-        path = source.path
+        path = ref.path
         if not path.is_dir():
-            labels = path.parent.parent / "labels" / f"{path.stem}.label"
-            return source.recording(1, lambda _: _read_sweep(path, labels))
-        with reading(source.name):
-            sequences = _sequences(source)
-        return source.select_sensor(sequences)
+            return _KittiRecording(ref.info(), [path], path.parent.parent / "labels")
+        name, folders = ref.choose_sensor(sequence_folders(path))
+        with reading(ref.name):
+            return _open_sequence(ref, name, *folders)
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> dict[str, bytes]:
@@ -375,15 +375,57 @@ def point_files(folder: Path) -> list[Path]:
     return sort_by_number(folder.glob("*.bin"))
 
 
-def _sequences(source: RecordingSource) -> dict[str, Recording]:
-    """Open all sequences in a folder."""
-    return {
-        name: _sequence(source, *folders, name)
-        for name, folders in sequence_folders(source.path).items()
-    }
+class _KittiRecording(FileRecording):
+    """Point files of a sequence.
+
+    Parameters
+    ----------
+    info
+        What is known about the sequence.
+    files
+        Point files in the order of the sweeps.
+    labels
+        Folder with the label files, which may not exist.
+    folder
+        Folder of the sequence, or None for a single file.
+    poses
+        Poses of the sweeps, of shape (n, 4, 4), or None.
+    times_ns
+        Timestamps of the sweeps in nanoseconds, of shape (n,), or None.
+    """
+
+    def __init__(
+        self,
+        info: RecordingInfo,
+        files: list[Path],
+        labels: Path,
+        folder: Path | None = None,
+        poses: Floats | None = None,
+        times_ns: Floats | None = None,
+    ) -> None:
+        super().__init__(info, files)
+        self._labels = labels
+        self._folder = folder
+        self._sweep_poses = poses
+        self._times_ns = times_ns
+
+    def load(self, number: int) -> Sweep:
+        file = self.paths[number]
+        pose = None if self._sweep_poses is None else self._sweep_poses[number]
+        time_ns = None if self._times_ns is None else self._times_ns[number]
+        return _read_sweep(file, self._labels / f"{file.stem}.label", pose=pose, time_ns=time_ns)
+
+    def load_stamps(self) -> Floats | None:
+        return self._times_ns
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        return None if self._folder is None else kitti_boxes.read_boxes(self._folder, self.paths)
+
+    def load_classes(self) -> dict[int, str]:
+        return {} if self._folder is None else _class_names(self._folder)
 
 
-def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "") -> Recording:
+def _open_sequence(ref: RecordingRef, name: str, folder: Path, points: Path) -> Recording:
     """Open a folder of sweeps, with labels, poses and times if they exist."""
     files = point_files(points)
     calibration = folder / CALIBRATION_FILE
@@ -400,24 +442,13 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
         )
     if folder.absolute() == points.absolute():
         notes += _notes_on_tables(folder.absolute())
-
-    def read(number: int) -> Sweep:
-        file = files[number]
-        pose = None if poses is None else poses[number]
-        time_ns = None if times_ns is None else times_ns[number]
-        labels = folder / "labels" / f"{file.stem}.label"
-        return _read_sweep(file, labels, pose=pose, time_ns=time_ns)
-
-    return source.recording(
-        len(files),
-        read,
-        read_stamps=None if times_ns is None else times_ns.tolist,
-        notes=source.prefix_notes(notes),
-        read_classes=partial(_class_names, folder),
-        read_boxes=partial(kitti_boxes.read_boxes, folder, files),
+    info = ref.info(
+        sensor=name,
         sequence=name,
-        calibration=calibration,
+        calibration=calibration.absolute(),
+        notes=ref.prefix_notes(notes),
     )
+    return _KittiRecording(info, files, folder / "labels", folder, poses, times_ns)
 
 
 @dataclass

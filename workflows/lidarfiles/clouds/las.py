@@ -36,7 +36,8 @@ from .gps_time import gps_start_s
 from .intensity_full_scale import compute_full_scale
 from .las_header import las_system, noise_classes, open_las
 from .point_field import NONE, OMITTED, PointField
-from .recording import Recording, RecordingSource
+from .recording import PointCloud
+from .recording_ref import RecordingRef
 from .return_numbers import return_numbers
 from .well_known_text import wkt
 from .writing import ExportSpec
@@ -190,9 +191,9 @@ class LAS(CloudFormat):
         return full_scale
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> PointCloud:
         """Open a .las or .laz file, whose points are read in parts."""
-        return _open_las(source)
+        return _LasCloud(ref)
 
 
 class LAZ(LAS):
@@ -380,53 +381,56 @@ def _name(name: str) -> str:
 # -- reading ---------------------------------------------------------------------------------
 
 
-def _open_las(source: RecordingSource) -> Recording:
-    """Open a .las or .laz file.
+class _LasCloud(PointCloud):
+    """A .las or .laz file, which is read in parts, or as an evenly spread sample."""
 
-    Its points are read in parts, or as an evenly spread sample.
-    """
-    path = source.path
-    with reading(source.name):
-        system = las_system(path)
-        with open_las(path) as reader:
-            count = reader.header.point_count
-            classes = noise_classes(reader.header)
-            positions = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
-        meters, notes = source.stated_meters(system, positions)
+    def __init__(self, ref: RecordingRef) -> None:
+        with reading(ref.name):
+            system = las_system(ref.path)
+            with open_las(ref.path) as reader:
+                count = reader.header.point_count
+                classes = noise_classes(reader.header)
+                positions = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
+            meters, notes = ref.stated_meters(system, positions)
+        super().__init__(
+            ref.info(
+                point_count=count,
+                meters=meters,
+                system=system,
+                epsg=ref.epsg_in_meters(system, meters),
+                noise_classes=classes,
+                notes=notes,
+            )
+        )
+        self._path = ref.path
+        self._count = count
 
-    def read_run(reader: laspy.LasReader, start: int, length: int) -> Sweep:
+    def __len__(self) -> int:
+        return -(-self._count // CHUNK_POINTS)
+
+    def load(self, number: int) -> Sweep:
+        start = number * CHUNK_POINTS
+        with open_las(self._path) as reader:
+            return self._read_run(reader, start, min(CHUNK_POINTS, self._count - start))
+
+    def load_sample(self, max_points: int) -> Sweep:
+        length = min(max_points // _SAMPLE_RUNS, self._count // _SAMPLE_RUNS)
+        starts = np.linspace(0, self._count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
+        with open_las(self._path) as reader:
+            return Sweep.concatenate(
+                [self._read_run(reader, int(start), length) for start in starts]
+            )
+
+    def _read_run(self, reader: laspy.LasReader, start: int, length: int) -> Sweep:
         reader.seek(start)
         points = reader.read_points(length)
         if len(points) != length:
-            raise CutShortError(f"its header declares {count:,} points, but it contains fewer")
+            raise CutShortError(
+                f"its header declares {self._count:,} points, but it contains fewer"
+            )
         names = [name for name in points.point_format.dimension_names if name not in _STEPS]
         columns = {name: np.asarray(points[name]) for name in names}
         return Sweep(np.stack([points.x, points.y, points.z], axis=1), columns)
-
-    def read(number: int) -> Sweep:
-        start = number * CHUNK_POINTS
-        with open_las(path) as reader:
-            return read_run(reader, start, min(CHUNK_POINTS, count - start))
-
-    def sample(max_points: int) -> Sweep:
-        length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
-        starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
-        with open_las(path) as reader:
-            return Sweep.concatenate([read_run(reader, int(start), length) for start in starts])
-
-    parts = -(-count // CHUNK_POINTS)
-    return source.recording(
-        parts,
-        read,
-        is_cloud=True,
-        point_count=count,
-        notes=notes,
-        meters=meters,
-        system=system,
-        epsg=source.epsg_in_meters(system, meters),
-        sample=sample,
-        noise_classes=classes,
-    )
 
 
 def _some_positions(reader: laspy.LasReader, count: int) -> Floats:

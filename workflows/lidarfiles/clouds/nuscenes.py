@@ -38,7 +38,8 @@ from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes
 from .point_field import OMITTED, PointField
 from .recorded_boxes import RecordedBoxes
-from .recording import Recording, RecordingSource, sweep_from_columns
+from .recording import Recording, RecordingInfo, sweep_from_columns
+from .recording_ref import RecordingRef
 
 VERSION = "v1.0-lidarpool"
 FIRST_SENSOR = "LIDAR_TOP"
@@ -208,9 +209,26 @@ class NuScenes(MultiFileFormat):
         return rows[:, :3], columns
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open the sweeps of a lidar in a nuScenes data set."""
-        return _open_data_set(source)
+        folder = tables_folder(ref)
+        with reading(ref.name):
+            tables = NuScenesTables(folder)
+            lidars = tables.lidar_rows()
+        name, rows = ref.choose_sensor(lidars)
+        notes = []
+        if omitted := tables.omitted[name]:
+            notes.append(
+                f"contains only the {plural(len(rows), 'key frame')} of this lidar. The files of "
+                f"{plural(omitted, 'sweep')} between them, in the folder sweeps, are missing"
+            )
+        info = ref.info(
+            sensor=name,
+            sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
+            compensated=states_compensation(str(tables.scene(rows[0]).get("description"))),
+            notes=ref.prefix_notes(notes),
+        )
+        return _NuScenesRecording(info, tables, rows)
 
     @classmethod
     def merge_jobs(
@@ -583,52 +601,40 @@ def _visibility_token(visibility: Mapping[str, float | None]) -> str:
 # -- reading ---------------------------------------------------------------------------------
 
 
-def _open_data_set(source: RecordingSource) -> Recording:
-    """Open a lidar in a nuScenes data set."""
-    folder = tables_folder(source)
-    with reading(source.name):
-        tables = NuScenesTables(folder)
-        lidars = {
-            name: _recording(source, tables, rows, tables.omitted[name])
-            for name, rows in tables.lidar_rows().items()
-        }
-    return source.select_sensor(lidars)
+class _NuScenesRecording(Recording):
+    """The sweeps of a lidar in a nuScenes data set."""
+
+    def __init__(self, info: RecordingInfo, tables: NuScenesTables, rows: list[_Row]) -> None:
+        super().__init__(info)
+        self._tables = tables
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def load(self, number: int) -> Sweep:
+        return self._tables.read(self._rows[number])
+
+    def load_stamps(self) -> Floats:
+        return 1e3 * np.array([row["timestamp"] for row in self._rows])
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        return self._tables.boxes(self._rows)
 
 
-def _recording(
-    source: RecordingSource, tables: NuScenesTables, rows: list[_Row], omitted: int
-) -> Recording:
-    notes = []
-    if omitted:
-        notes.append(
-            f"contains only the {plural(len(rows), 'key frame')} of this lidar. The files of "
-            f"{plural(omitted, 'sweep')} between them, in the folder sweeps, are missing"
-        )
-    times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
-    return source.recording(
-        len(rows),
-        lambda number: tables.read(rows[number]),
-        read_stamps=times_ns.tolist,
-        read_boxes=lambda: tables.boxes(rows),
-        notes=source.prefix_notes(notes),
-        compensated=states_compensation(str(tables.scene(rows[0]).get("description"))),
-        sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
-    )
-
-
-def tables_folder(source: RecordingSource) -> Path:
+def tables_folder(ref: RecordingRef) -> Path:
     """Return the folder with the tables of a data set, given this folder or the root folder.
 
     Raises LidarError if the root folder contains several versions of the tables.
     """
-    tables = source.path
+    tables = ref.path
     if not (tables / _SWEEP_TABLE).is_file():
-        versions = sorted(table.parent for table in source.path.glob(f"v1.0-*/{_SWEEP_TABLE}"))
+        versions = sorted(table.parent for table in ref.path.glob(f"v1.0-*/{_SWEEP_TABLE}"))
         if len(versions) > 1:
             names = ", ".join(version.name for version in versions)
             raise LidarError(
-                f"{source.name} contains several versions of nuScenes: {names}. Specify the "
-                f"folder of one version, for example {source.name}/{versions[0].name}."
+                f"{ref.name} contains several versions of nuScenes: {names}. Specify the "
+                f"folder of one version, for example {ref.name}/{versions[0].name}."
             )
         (tables,) = versions
     return tables.absolute()

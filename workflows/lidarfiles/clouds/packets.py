@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
@@ -16,7 +17,9 @@ from lidarsim.sweeps.sweeps import make_identifiers
 
 from .cloud_format import CloudFormat
 from .point_field import OMITTED, PointField
-from .recording import Recording, RecordingSource, sweep_from_columns
+from .recording import Recording, sweep_from_columns
+from .recording_ref import RecordingRef
+from .sequential_recording import SequentialRecording
 from .writing import ExportSpec
 
 
@@ -88,28 +91,36 @@ class PacketCapture(CloudFormat):
                 (path / f"{name}{suffix}").write_bytes(content)
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open the packets of a sensor with the decoder for its manufacturer."""
-        return _open_capture(source)
+        return _CaptureRecording(ref)
 
 
-def _open_capture(source: RecordingSource) -> Recording:
-    decoder = decoder_of(source.path, source.name)
-    name = source.choose("sensors", decoder.sensors)
-    sensor = [*decoder.sensors].index(name)
+class _CaptureRecording(SequentialRecording):
+    """Packets of one sensor."""
 
-    def convert(sweep: Any) -> Sweep:
-        columns = dict(decoder.columns(sensor, sweep))
-        return sweep_from_columns(columns, time_ns=decoder.time_ns(sweep), sensor=name)
+    def __init__(self, ref: RecordingRef) -> None:
+        self._decoder = decoder_of(ref.path, ref.name)
+        name = ref.choose("sensors", self._decoder.sensors)
+        self._sensor = [*self._decoder.sensors].index(name)
+        has_reflectivities = ref.intensity in (None, self._decoder.intensity)
+        with reading(ref.name):
+            count = sum(1 for _ in self.stored_sweeps())
+        info = ref.info(
+            sensor=name,
+            compensated=False,
+            white=WHITE if has_reflectivities else None,
+            notes=ref.prefix_notes(self._decoder.notes),
+        )
+        super().__init__(info, count)
 
-    sweeps = partial(decoder.sweeps, sensor)
-    white = WHITE if source.intensity in (None, decoder.intensity) else None
-    return source.stream(
-        sweeps,
-        convert,
-        white=white,
-        compensated=False,
-        sensor=name,
-        read_stamps=lambda: map(decoder.time_ns, sweeps()),
-        notes=source.prefix_notes(decoder.notes),
-    )
+    def stored_sweeps(self) -> Iterable[Any]:
+        return self._decoder.sweeps(self._sensor)
+
+    def convert(self, stored: Any) -> Sweep:
+        columns = dict(self._decoder.columns(self._sensor, stored))
+        return sweep_from_columns(columns, time_ns=self._decoder.time_ns(stored))
+
+    def load_stamps(self) -> list[float]:
+        with self.lock:
+            return [self._decoder.time_ns(sweep) for sweep in self.stored_sweeps()]

@@ -22,7 +22,8 @@ from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat
 from .parquet_groups import check_groups, group_allowance, number_columns, read_group
-from .recording import Recording, RecordingSource, sweep_from_columns
+from .recording import PointCloud, sweep_from_columns
+from .recording_ref import RecordingRef
 
 _GROUP_ROWS = 65_536
 
@@ -122,13 +123,13 @@ class Parquet(MultiFileFormat):
         return job.in_sensor(sweep, Cloud(positions, columns))
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> PointCloud:
         """Open a .parquet file or a folder of such files.
 
         Row groups are read separately.
         """
-        with reading(source.name):
-            return _parts(source)
+        with reading(ref.name):
+            return _ParquetCloud(ref)
 
 
 def _dataset(storage: Storage, folder: str) -> Any:
@@ -158,44 +159,44 @@ def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any
     return cache[key]
 
 
-def _parts(source: RecordingSource) -> Recording:
-    """Open the row groups of a file or folder.
+class _ParquetCloud(PointCloud):
+    """The row groups of a file or folder.
 
     Only numeric columns are read, because the memory that other columns require is not known in
     advance.
     """
-    import pyarrow.dataset
 
-    path = source.path
-    if path.is_file():
-        input_size(path)
-    dataset = pyarrow.dataset.dataset(str(path), format="parquet")
-    groups = []
-    files = []  # numeric columns and file size in bytes, for each row group
-    unread = set[str]()  # names of skipped columns
-    for file in dataset.get_fragments():
-        columns = number_columns(file.physical_schema)
-        unread |= set(file.physical_schema.names) - set(columns)
-        size = input_size(file.path)
-        of_file = file.split_by_row_group()
-        check_groups(of_file, columns, size)
-        groups += of_file
-        files += len(of_file) * [(columns, size)]
-    if axes := sorted(unread.intersection("xyz")):
-        raise ValueError(f"its coordinate columns are not numeric: {', '.join(axes)}")
+    def __init__(self, ref: RecordingRef) -> None:
+        import pyarrow.dataset
 
-    def read(number: int) -> Sweep:
-        number_names, size = files[number]
-        rows = read_group(groups[number], number_names, group_allowance(size))
+        path = ref.path
+        if path.is_file():
+            input_size(path)
+        dataset = pyarrow.dataset.dataset(str(path), format="parquet")
+        self._groups: list[Any] = []
+        # Numeric columns and file size in bytes, for each row group.
+        self._files: list[tuple[list[str], int]] = []
+        unread = set[str]()  # names of skipped columns
+        for file in dataset.get_fragments():
+            columns = number_columns(file.physical_schema)
+            unread |= set(file.physical_schema.names) - set(columns)
+            size = input_size(file.path)
+            of_file = file.split_by_row_group()
+            check_groups(of_file, columns, size)
+            self._groups += of_file
+            self._files += len(of_file) * [(columns, size)]
+        if axes := sorted(unread.intersection("xyz")):
+            raise ValueError(f"its coordinate columns are not numeric: {', '.join(axes)}")
+        notes = []
+        if unread:
+            names = ", ".join(sorted(unread))
+            notes.append(f"has non-numeric columns, which were skipped: {names}")
+        super().__init__(ref.info(point_count=dataset.count_rows(), notes=ref.prefix_notes(notes)))
+
+    def __len__(self) -> int:
+        return len(self._groups)
+
+    def load(self, number: int) -> Sweep:
+        names, size = self._files[number]
+        rows = read_group(self._groups[number], names, group_allowance(size))
         return sweep_from_columns({name: rows[name].to_numpy() for name in rows.column_names})
-
-    notes = []
-    if unread:
-        notes.append(f"has non-numeric columns, which were skipped: {', '.join(sorted(unread))}")
-    return source.recording(
-        len(groups),
-        read,
-        is_cloud=True,
-        point_count=dataset.count_rows(),
-        notes=source.prefix_notes(notes),
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,10 @@ from lidarsim.scene.colors import pack_as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
-from ..processes.per_process import PerProcess
 from .multi_file_format import MultiFileFormat
 from .point_field import OMITTED, PointField
-from .recording import Recording, RecordingSource
+from .recording import FileRecording, Recording
+from .recording_ref import RecordingRef
 from .writing import ExportSpec
 
 _COMMENT_BYTES = 1000  # maximum number of bytes that are read from the first line
@@ -96,12 +97,12 @@ class PCD(MultiFileFormat):
         return fields
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open a PCD file, or a folder with one file per sweep.
 
         The pose of each sweep is the VIEWPOINT in its file.
         """
-        return _open_files(source, point_files(source.path))
+        return _PCDRecording(ref, point_files(ref.path))
 
 
 def point_files(path: Path) -> list[Path]:
@@ -111,33 +112,42 @@ def point_files(path: Path) -> list[Path]:
     return sort_by_number(file for file in path.iterdir() if file.suffix.lower() == ".pcd")
 
 
-def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
-    def read(number: int) -> Sweep:
-        path = files[number]
-        with reading(path.name) if len(files) > 1 else nullcontext():
+class _PCDRecording(FileRecording):
+    """PCD files, each with the points of a sweep."""
+
+    def __init__(self, ref: RecordingRef, files: list[Path]) -> None:
+        notes = []
+        if skipped := skipped_frames(files):
+            notes.append(
+                f"has no file for {frames_in_words(skipped)} and no times, so its sweeps are "
+                "treated as evenly spaced"
+            )
+        super().__init__(
+            ref.info(
+                meters=ref.chosen_meters(),
+                compensated=_stated_compensation(files[0]),
+                files=tuple(path.name for path in files),
+                notes=ref.prefix_notes(notes),
+            ),
+            files,
+        )
+
+    def load(self, number: int) -> Sweep:
+        path = self.paths[number]
+        with reading(path.name) if len(self) > 1 else nullcontext():
             (sweep,) = read_pcd(path)
-            if number and (name := _intensity_name(sweep)) != first_intensity():
+            first = self._first_intensity if number else None
+            if number and (name := _intensity_name(sweep)) != first:
                 raise ValueError(
-                    f"its intensities are in {name or 'no column'}, but those of {files[0].name} "
-                    f"are in {first_intensity() or 'no column'}. Use files with the same columns"
+                    f"its intensities are in {name or 'no column'}, but those of "
+                    f"{self.paths[0].name} are in {first or 'no column'}. Use files with the same "
+                    "columns"
                 )
         return sweep
 
-    notes = []
-    if skipped := skipped_frames(files):
-        notes.append(
-            f"has no file for {frames_in_words(skipped)} and no times, so its sweeps are treated "
-            "as evenly spaced"
-        )
-    first_intensity = PerProcess(lambda: _intensity_name(read_pcd(files[0])[0]))
-    return source.recording(
-        len(files),
-        read,
-        meters=source.chosen_meters(),
-        compensated=_stated_compensation(files[0]),
-        files=[path.name for path in files],
-        notes=source.prefix_notes(notes),
-    )
+    @cached_property
+    def _first_intensity(self) -> str | None:
+        return _intensity_name(read_pcd(self.paths[0])[0])
 
 
 def _intensity_name(sweep: Sweep) -> str | None:

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -30,7 +29,9 @@ from lidarsim.words import printable
 from ..open3d_access.open3d_module import load_open3d
 from .cloud_format import CloudFormat, PointColumns
 from .job_reader import JobReader
-from .recording import Recording, RecordingSource, open_cloud, sweep_from_columns
+from .recording import PointCloud, Recording, sweep_from_columns
+from .recording_ref import RecordingRef
+from .results import open_cloud
 from .writing import ExportSpec
 
 # Positions are stored as float32 if the error is below this fraction of the precision.
@@ -79,11 +80,16 @@ class PLY(CloudFormat):
         return job.in_sensor(sweep, cloud)
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording | PointCloud:
         """Open a .ply file or a result folder, whose cloud has sweeps."""
-        if source.path.is_dir():
-            source = replace(source, path=source.path / FILE)
-        return _open_file(source)
+        path = ref.path / FILE if ref.path.is_dir() else ref.path
+        if ref.as_stored:
+            return _ForeignCloud(ref, path)
+        try:
+            cloud = CloudFile(path)
+        except LidarError:  # a text file, or a file from another program
+            return _ForeignCloud(ref, path)
+        return _open_own(ref, path, cloud)
 
 
 class PlyAppender:
@@ -395,64 +401,55 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
 # -- reading ---------------------------------------------------------------------------------
 
 
-def _open_file(source: RecordingSource) -> Recording:
-    if source.as_stored:
-        return _open_foreign(source)
-    try:
-        cloud = CloudFile(source.path)
-    except LidarError:  # a text file, or a file from another program
-        return _open_foreign(source)
-    return replace(_open_own(source, cloud), meters=source.chosen_meters())
-
-
-def _open_foreign(source: RecordingSource) -> Recording:
-    """Open a .ply text file, or a .ply file from another program.
+class _ForeignCloud(PointCloud):
+    """A .ply text file, or a .ply file from another program.
 
     Positions are in the units of the coordinate system that the file declares.
     """
-    # Imported late, because results of this package need no reader for other programs' files.
-    from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 
-    def read(_: int) -> Sweep:
-        return sweep_from_columns(read_ply_columns(read_input(source.path)))
+    def __init__(self, ref: RecordingRef, path: Path) -> None:
+        # Imported late, because results of this package need no reader for other programs' files.
+        from lidarsim.scene.files.polygon_files import ply_comments
 
-    with reading(source.name):
-        system = StatedSystem.from_comments(ply_comments(read_input(source.path)))
-        is_checked = system is not None and not source.as_stored
-        positions = read(0).points if is_checked else np.zeros((0, 3))
-        meters, notes = source.stated_meters(system, positions)
-    return source.recording(
-        1,
-        read,
-        is_cloud=True,
-        notes=notes,
-        meters=meters,
-        system=system,
-        epsg=source.epsg_in_meters(system, meters),
-    )
+        super().__init__(ref.info())
+        self._path = path
+        with reading(ref.name):
+            system = StatedSystem.from_comments(ply_comments(read_input(path)))
+            is_checked = system is not None and not ref.as_stored
+            positions = self.load(0).points if is_checked else np.zeros((0, 3))
+            meters, notes = ref.stated_meters(system, positions)
+        epsg = ref.epsg_in_meters(system, meters)
+        self.info = ref.info(meters=meters, system=system, epsg=epsg, notes=notes)
+
+    def __len__(self) -> int:
+        return 1
+
+    def load(self, number: int) -> Sweep:
+        from lidarsim.scene.files.polygon_files import read_ply_columns
+
+        return sweep_from_columns(read_ply_columns(read_input(self._path)))
 
 
-def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
+def _open_own(ref: RecordingRef, path: Path, cloud: CloudFile) -> Recording | PointCloud:
     """Open a .ply file written by lidarpool, with sweeps if it belongs to a result."""
-    if not (sweeps_path := source.path.with_name(SWEEPS_FILE)).exists():
-        return open_cloud(source.name, cloud, None, source.sensor, source.intensity)
+    meters = ref.chosen_meters()
+    sweeps_path = path.with_name(SWEEPS_FILE)
+    if not sweeps_path.exists():
+        return open_cloud(ref.info(meters=meters), cloud, None, ref.sensor)
     try:
-        report = json.loads(read_input(source.path.with_name("report.json")))
+        report = json.loads(read_input(path.with_name("report.json")))
         keep_every = int(report["parameters"]["keep_every"])
     except (OSError, ValueError, TypeError, LookupError, LidarError):
         keep_every = 1
     note = (
-        f"{source.name} contains only one in every {keep_every} hits, so its gaps do not "
+        f"{ref.name} contains only one in every {keep_every} hits, so its gaps do not "
         "represent lost returns. To compare lost returns, run the survey with `keep_every: 1`"
     )
-    fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
-    source.selected.add(source.sensor or "")
+    is_thinned = keep_every > 1
     return open_cloud(
-        source.name,
+        ref.info(meters=meters, thinned=is_thinned, notes=(note,) if is_thinned else ()),
         cloud,
         partial(Sweeps.load, sweeps_path),
-        source.sensor,
-        source.intensity,
-        has_measured_poses=source.path.with_name(TRAJECTORY_FILE).exists(),
-        **fields,
+        ref.sensor,
+        has_measured_poses=path.with_name(TRAJECTORY_FILE).exists(),
     )

@@ -18,27 +18,27 @@ from lidarsim.motion.trajectory import Track, full_poses
 from lidarsim.numerics.arrays import Floats
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
-from .recording import Recording
+from .recording import PointCloud, Recording
 
 
 @dataclass(frozen=True, eq=False)
 class PosedSweeps:
-    """Sweeps of a recording, which are read with their poses.
+    """Sweeps of a recording, which are read with their poses. The parts of a cloud have none.
 
     Attributes
     ----------
     recording
-        A recording that is not a cloud.
+        The recording or cloud.
     notes
         Notes for the user on the sweeps that have been read so far.
     """
 
-    recording: Recording
+    recording: Recording | PointCloud
     notes: list[str] = field(default_factory=list)
     _poses: dict[int, Floats | None] = field(default_factory=dict)
 
     def read(self, number: int, *, as_fired: bool = False) -> Sweep:
-        """Read the returns of a sweep.
+        """Read the returns of a sweep or of a part of a cloud.
 
         The sweep has a `pose` unless it is unknown. If its points are as fired, it also has their
         `firing_poses`, as far as these are known. If `as_fired` is true, compensated points of
@@ -50,11 +50,14 @@ class PosedSweeps:
             If the recording cannot be read.
         """
         recording = self.recording
-        if recording.fired is not None and (as_fired or recording.compensated is False):
-            return recording.read_fired(number)
+        if isinstance(recording, PointCloud):
+            return recording[number].returns()
+        info = recording.info
+        if info.has_firing_poses and (as_fired or info.compensated is False):
+            return recording.fired(number)
         sweep = recording[number].returns()
-        if sweep.pose is None:
-            sweep = sweep.replace(pose=self._pose(number))
+        if sweep.pose is None and self.recorded_poses is not None:
+            sweep = sweep.replace(pose=self.recorded_poses[number])
         self._poses[number] = sweep.pose
         if sweep.compensated is not False or sweep.firing_poses is not None or sweep.pose is None:
             return sweep
@@ -78,15 +81,18 @@ class PosedSweeps:
         The poses, or None if they are unknown. In the latter case, a note is added if the sensor
         moves.
         """
-        stamps_ns = self.recording.stamps_ns
+        recording = self.recording
+        if isinstance(recording, PointCloud):
+            return None
+        stamps_ns = recording.stamps_ns
         path = None
         if times_s is not None and stamps_ns is not None:
-            path = path_of_sweep(self._pose, stamps_ns[: len(self.recording)], number)
+            path = path_of_sweep(self._pose, stamps_ns[: len(recording)], number)
         if path is None or times_s is None:
-            if np.any(self._pose(0) != self._pose(len(self.recording) - 1)):
+            if np.any(self._pose(0) != self._pose(len(recording) - 1)):
                 missing = "its points" if times_s is None else "its sweeps"
                 note = (
-                    f"{self.recording.name} contains points as fired, but not the times of "
+                    f"{recording.info.name} contains points as fired, but not the times of "
                     f"{missing}. All points of a sweep are placed at the pose of the sweep"
                 )
                 self.notes.extend([note] if note not in self.notes else [])
@@ -102,7 +108,7 @@ class PosedSweeps:
 
         The shape is (s, 4, 4).
         """
-        if self.recording.read_poses is None:
+        if isinstance(self.recording, PointCloud) or not self.recording.has_stored_poses:
             return None
         return self.recording.poses(range(len(self.recording)))
 

@@ -1,4 +1,4 @@
-"""Recordings in any file format. A recording consists of sweeps, or of parts of a cloud.
+"""Recordings in any file format: sequences of sweeps, and clouds that are read in parts.
 
 When an item is read, its columns get standard names, its positions are converted to meters, the
 chosen column becomes the intensity, and withheld points are omitted. Rings and point times that a
@@ -8,31 +8,26 @@ file does not specify are determined from a few sweeps on first use.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
-from threading import RLock
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self, SupportsIndex
 
 import numpy as np
 
-from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.column_names import STRENGTHS, with_standard_names
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.environment.extras import reading
-from lidarsim.errors import CutShortError, LidarError
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, OmittedPoints, usable_points
 from lidarsim.scene.files.pcd import split_rgb
-from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
-from lidarsim.sweeps.sweeps import Sweeps
-from lidarsim.words import did_you_mean, join_names, plural
+from lidarsim.scene.files.stated_system import Meters, StatedSystem
+from lidarsim.schema.value_texts import one_line
+from lidarsim.words import did_you_mean, plural
 
-from ..identity.fingerprint import fingerprint
-from ..processes.per_process import PerProcess
 from .point_times import PointTimes
 from .recorded_boxes import RecordedBoxes
 from .rings import Rings
@@ -61,18 +56,6 @@ def _check_poses(poses: Floats, numbers: Sequence[int]) -> None:
         )
 
 
-class SeveralSensorsError(LidarError):
-    """Error raised if a recording has several sensors or topics and none was chosen.
-
-    `contents` is a sentence that lists them, and `option` is the option that chooses one of them.
-    """
-
-    def __init__(self, contents: str, names: Sequence[str], option: str = "--sensor") -> None:
-        super().__init__(f"{contents} Choose one of them with `{option}`.")
-        self.contents = contents
-        self.names = names
-
-
 class RayTimes(NamedTuple):
     """Start times and poses of sweeps, which identify their rays."""
 
@@ -96,47 +79,29 @@ class RayTimes(NamedTuple):
         )
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Recording:
-    """A sequence of sweeps of one sensor. A cloud without sweeps is divided into parts instead.
+@dataclass(frozen=True, repr=False)
+class RecordingInfo:
+    """What is known about a recording or cloud before its points are read.
 
-    ``len(recording)`` is the number of items, and ``recording[number]`` reads an item as a `Sweep`.
-
-    Parameters
+    Attributes
     ----------
     name
         Name that is used in messages.
-    count
-        Number of sweeps or parts.
-    read
-        Function that returns the sweep with a given number. The sweep has the units and column
-        names of the file.
-    is_cloud
-        Whether the items are parts of a cloud without sweeps.
-    point_count
-        Number of points in a cloud, or None if it is not known before the points are read.
+    sensor
+        Name of the sensor or topic, or an empty string.
+    sequence
+        Name of the drive if the file contains several drives, each with its own world frame.
+        Otherwise an empty string.
     intensity_column
         Column that the user chose as intensity, or None for the default.
-    read_stamps
-        Function that returns the timestamps of all sweeps in nanoseconds, or None.
-    read_poses
-        Function that returns the poses of all sweeps in the world frame, with shape (count, 4, 4).
-        It returns None if a pose is unknown. It is faster than reading every sweep.
-    read_classes
-        Function that returns the names of the semantic classes by number, or None if the format
-        does not store them.
-    read_boxes
-        Function that returns the boxes of labeled objects in all sweeps. It returns None if the
-        recording has no labels of objects.
-    fired
-        Function that returns the sweep with a given number as fired, including its `firing_poses`.
-        None if the firing poses are unknown, as in most recordings from real sensors.
-    sample
-        Function that returns approximately the given number of points, which are evenly distributed
-        in the file.
+    point_count
+        Number of points, or None if it is not known before the points are read.
     compensated
         Whether the points are compensated for the motion of the sensor, according to the file or
         its format. None if this is unknown, or if the sensor does not move.
+    has_firing_poses
+        Whether the sensor poses at all firing times are known, as in results, so that sweeps can be
+        read as fired.
     meters
         Units of x, y and z in meters.
     system
@@ -145,16 +110,11 @@ class Recording:
         EPSG code of the coordinates, or None if they are not in a known system with the unit meter.
     world_origin
         Local origin in world coordinates, in meters, that lidarpool has added to the points of a
-        result. Shape (3,). None if nothing was added, or if it is unknown.
+        result. None if nothing was added, or if it is unknown.
     is_metric
         Whether the format defines coordinates as true meters, regardless of the coordinate system.
-    sensor
-        Name of the sensor or topic, or an empty string.
-    sequence
-        Name of the drive if the file contains several drives, each with its own world frame.
-        Otherwise an empty string.
     calibration
-        Path of the file calib.txt in KITTI, which may not exist.
+        Absolute path of the file calib.txt in KITTI, which may not exist.
     stations
         Names of the sweeps if each sweep was recorded at a scan station. The name of an unnamed
         sweep is an empty string.
@@ -167,161 +127,35 @@ class Recording:
     energy_unit
         Intensity of a white surface at 10 m if intensities are proportional to energies, otherwise
         None. In results, it is 1.
-    ray_times
-        Times and poses that identify the rays of the recording, or None if they are unknown.
     noise_classes
         Classes of noise points, which are omitted together with withheld points. None to keep all
         points.
     notes
-        Sentences for the user. Notes about poses are added when the poses are read.
+        Sentences for the user.
     """
 
     name: str
-    count: int
-    read: Callable[[int], Sweep]
-    is_cloud: bool = False
-    point_count: int | None = None
+    sensor: str = ""
+    sequence: str = ""
     intensity_column: str | None = None
-    read_stamps: Callable[[], Iterable[float]] | None = None
-    read_poses: Callable[[], Floats | None] | None = None
-    read_classes: Callable[[], Mapping[int, str]] | None = None
-    read_boxes: Callable[[], RecordedBoxes | None] | None = None
-    fired: Callable[[int], Sweep] | None = None
-    sample: Callable[[int], Sweep] | None = None
+    point_count: int | None = None
     compensated: bool | None = None
+    has_firing_poses: bool = False
     meters: Meters = METERS
     system: StatedSystem | None = None
     epsg: int | None = None
-    world_origin: Floats | None = None
+    world_origin: tuple[float, float, float] | None = None
     is_metric: bool = False
-    sensor: str = ""
-    sequence: str = ""
     calibration: Path | None = None
-    stations: Sequence[str] = ()
-    files: Sequence[str] = ()
+    stations: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
     thinned: bool = False
     white: float | None = None
     energy_unit: float | None = None
-    ray_times: RayTimes | None = None
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
-    notes: Sequence[str] = ()
-    # {number of an item: points omitted from it}
-    _omitted: dict[int, OmittedPoints] = field(default_factory=dict, init=False)
+    notes: tuple[str, ...] = ()
 
-    def __repr__(self) -> str:
-        if self.is_cloud:
-            return f"<Recording {self.name}: cloud in {plural(self.count, 'part')}>"
-        motion = {True: ", motion-compensated", False: ", as fired", None: ""}[self.compensated]
-        return f"<Recording {self.name}: {plural(self.count, 'sweep')}{motion}>"
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, number: int) -> Sweep:
-        """Read a sweep or a part of a cloud.
-
-        Raises LidarError if the recording cannot be read, and IndexError if the item does not
-        exist.
-        """
-        number = operator.index(number)
-        if not -self.count <= number < self.count:
-            items = plural(self.count, "part" if self.is_cloud else "sweep")
-            raise IndexError(f"{self.name} has {items}, so {number} is out of range")
-        number %= self.count
-        with reading(self.name):
-            return self._resolved(number, self.read(number))
-
-    def section(self, first: int, count: int) -> Recording:
-        """Return a recording that consists of `count` consecutive sweeps, starting at `first`."""
-        stop = first + count
-        read_stamps, read_poses, fired = self.read_stamps, self.read_poses, self.fired
-
-        boxes = self.read_boxes
-
-        def section_boxes() -> RecordedBoxes | None:
-            read = None if boxes is None else boxes()
-            return None if read is None else read.section(first, count)
-
-        def section_poses() -> Floats | None:
-            poses = None if read_poses is None else read_poses()
-            return None if poses is None else poses[first:stop]
-
-        return replace(
-            self,
-            count=count,
-            read=lambda number: self.read(first + number),
-            read_stamps=None if read_stamps is None else lambda: [*read_stamps()][first:stop],
-            read_poses=None if read_poses is None else section_poses,
-            read_boxes=None if boxes is None else section_boxes,
-            fired=None if fired is None else lambda number: fired(first + number),
-            stations=self.stations[first:stop],
-            files=self.files[first:stop],
-        )
-
-    def read_fired(self, number: int) -> Sweep:
-        """Read the returns of a sweep without motion compensation, if possible.
-
-        Each return is then in the sensor frame at the time of its firing. If the recording does not
-        contain such points, the returns are as stored.
-        """
-        if self.fired is None:
-            return self[number].returns()
-        with reading(self.name):
-            return self._resolved(number, self.fired(number)).returns()
-
-    def read_sample(self, max_points: int) -> Sweep:
-        """Read approximately `max_points` points from a cloud that has the function `sample`."""
-        assert self.sample is not None
-        with reading(self.name):
-            return self._resolved(None, self.sample(max_points))
-
-    def _resolved(self, number: int | None, sweep: Sweep) -> Sweep:
-        """Convert a stored sweep to standard column names and meters, without withheld points.
-
-        `number` is None for a sample, whose omitted points are not counted.
-        """
-        if self.noise_classes is not None:
-            usable, omitted = usable_points(sweep.columns, self.noise_classes)
-            if number is not None:
-                self._omitted[number] = omitted
-            if usable is not None:
-                sweep = sweep.select(usable)
-        standard = split_rgb(with_standard_names(sweep.columns))
-        columns = self._chosen_intensity(sweep.columns, standard)
-        points = sweep.points
-        if self.meters != METERS:
-            points = np.asarray(points, np.float64) * self.meters
-        pose = sweep._pose
-        if pose is not None and not callable(pose):
-            _check_poses(np.asarray(pose)[None], [number or 0])
-        if self.meters != METERS and sweep.pose is not None:
-            pose = sweep.pose.copy()
-            pose[:3, 3] *= self.meters
-        changes: dict[str, Any] = {}
-        if not self.is_cloud:
-            changes = {"recording": self, "number": number or 0}
-        if sweep.compensated is None:
-            changes["compensated"] = self.compensated
-        if not sweep.sensor:
-            changes["sensor"] = self.sensor
-        return sweep.replace(points=points, columns=columns, pose=pose, **changes)
-
-    def _chosen_intensity(self, stored: Columns, standard: Columns) -> Columns:
-        """Return the standard columns with the chosen column as intensity.
-
-        Raises ValueError if the chosen column does not exist.
-        """
-        name = self.intensity_column
-        if name is None:
-            return standard
-        for columns in (stored, standard):
-            if name in columns:
-                return {**standard, "intensity": np.asarray(columns[name])}
-        available = f" Available columns: {', '.join(stored)}." if stored else ""
-        raise ValueError(
-            f"it has no column {name!r} that could be used as intensity."
-            + (did_you_mean(name, stored) or available)
-        )
+    __repr__ = one_line
 
     @property
     def energies(self) -> bool:
@@ -333,12 +167,251 @@ class Recording:
         """Name of the column that was chosen as intensity, which is "intensity" by default."""
         return self.intensity_column or STRENGTHS[0]
 
+
+class PointSource(ABC):
+    """Points of a file that are read item by item, each as a `Sweep`.
+
+    ``len(source)`` is the number of items, and ``source[number]`` reads an item. The subclasses
+    `Recording` and `PointCloud` define what an item is. A source that was opened from a file is
+    pickled as a reference to the file, which each process opens once.
+
+    Parameters
+    ----------
+    info
+        What is known before the points are read.
+    """
+
+    _item: ClassVar[str]  # noun for an item in messages
+    # Function that opens the source again in another process. It can be pickled. None if the source
+    # was not opened from a file.
+    _reopen: Callable[[], PointSource] | None = None
+
+    def __init__(self, info: RecordingInfo) -> None:
+        self.info = info
+        self._omitted: dict[int, OmittedPoints] = {}  # {number of an item: omitted points}
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of items."""
+
+    @abstractmethod
+    def load(self, number: int) -> Sweep:
+        """Read the item with a given number, with the units and column names of the file.
+
+        Formats implement this method. Other code uses ``source[number]``.
+        """
+
+    def __getitem__(self, number: int) -> Sweep:
+        """Read an item.
+
+        Raises LidarError if the file cannot be read, and IndexError if the item does not exist.
+        """
+        number = operator.index(number)
+        count = len(self)
+        if not -count <= number < count:
+            items = plural(count, self._item)
+            raise IndexError(f"{self.info.name} has {items}, so {number} is out of range")
+        number %= count
+        with reading(self.info.name):
+            return self.standardize(number, self.load(number))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user, including those about poses that have been read."""
+        return self.info.notes
+
+    @property
+    def ray_times(self) -> RayTimes | None:
+        """Times and poses that identify the rays of sweeps, or None if they are unknown."""
+        return None
+
     @property
     def omission_notes(self) -> list[str]:
         """Notes about points that were omitted from the items read so far."""
         totals = np.sum([(0, 0), *self._omitted.values()], axis=0).tolist()
         note = OmittedPoints(*totals).omission_note()
-        return [f"{self.name}: {note}"] if note else []
+        return [f"{self.info.name}: {note}"] if note else []
+
+    def with_info(self, **changes: Any) -> Self:
+        """Return a copy in which some fields of `info` have new values."""
+        return self._with(replace(self.info, **changes))
+
+    def reopened_by(self, reopen: Callable[[], PointSource]) -> Self:
+        """Return a copy that other processes open with a function, which must be picklable."""
+        other = self._with(self.info)
+        other._reopen = reopen
+        return other
+
+    def _with(self, info: RecordingInfo) -> Self:
+        other = object.__new__(type(self))
+        other.__dict__ |= {k: v for k, v in self.__dict__.items() if k not in _DERIVED}
+        PointSource.__init__(other, info)
+        return other
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        if self._reopen is not None:
+            return _opened_again, (self._reopen, self.info)
+        return super().__reduce_ex__(protocol)
+
+    def standardize(self, number: int | None, sweep: Sweep) -> Sweep:
+        """Convert a stored item to standard column names and meters, without withheld points.
+
+        Parameters
+        ----------
+        number
+            Number of the item, or None for a sample, whose omitted points are not counted.
+        sweep
+            Item with the units and column names of the file.
+
+        Raises
+        ------
+        ValueError
+            If the chosen intensity column does not exist, or if the pose is invalid.
+        """
+        info = self.info
+        if info.noise_classes is not None:
+            usable, omitted = usable_points(sweep.columns, info.noise_classes)
+            if number is not None:
+                self._omitted[number] = omitted
+            if usable is not None:
+                sweep = sweep.select(usable)
+        standard = split_rgb(with_standard_names(sweep.columns))
+        columns = _with_intensity(info.intensity_column, sweep.columns, standard)
+        points = sweep.points
+        if info.meters != METERS:
+            points = np.asarray(points, np.float64) * info.meters
+        pose = sweep._pose
+        if pose is not None and not callable(pose):
+            _check_poses(np.asarray(pose)[None], [number or 0])
+        if info.meters != METERS and sweep.pose is not None:
+            pose = sweep.pose.copy()
+            pose[:3, 3] *= info.meters
+        changes: dict[str, Any] = {}
+        if sweep.compensated is None:
+            changes["compensated"] = info.compensated
+        if not sweep.sensor:
+            changes["sensor"] = info.sensor
+        return sweep.replace(points=points, columns=columns, pose=pose, **changes)
+
+
+def _opened_again(reopen: Callable[[], PointSource], info: RecordingInfo) -> PointSource:
+    source = reopen()
+    return source if source.info == info else source._with(info)
+
+
+def _with_intensity(name: str | None, stored: Columns, standard: Columns) -> Columns:
+    """Return the standard columns with the chosen column as intensity.
+
+    Raises ValueError if the chosen column does not exist.
+    """
+    if name is None:
+        return standard
+    for columns in (stored, standard):
+        if name in columns:
+            return {**standard, "intensity": np.asarray(columns[name])}
+    available = f" Available columns: {', '.join(stored)}." if stored else ""
+    raise ValueError(
+        f"it has no column {name!r} that could be used as intensity."
+        + (did_you_mean(name, stored) or available)
+    )
+
+
+class PointCloud(PointSource):
+    """A cloud without sweeps, which is read in parts of limited size.
+
+    ``len(cloud)`` is the number of parts, and ``cloud[number]`` reads a part as a `Sweep` in the
+    frame of the cloud. Formats implement `load` and ``__len__``.
+    """
+
+    _item = "part"
+
+    def __repr__(self) -> str:
+        return f"<PointCloud {self.info.name}: {plural(len(self), 'part')}>"
+
+    def sample(self, max_points: int) -> Sweep | None:
+        """Read approximately `max_points` points that are evenly distributed in the file.
+
+        Returns None if the format cannot read a sample without reading all points.
+        """
+        with reading(self.info.name):
+            sample = self.load_sample(max_points)
+            return None if sample is None else self.standardize(None, sample)
+
+    def load_sample(self, max_points: int) -> Sweep | None:
+        """Read a sample with the units and column names of the file, or None if this is slow."""
+        return None
+
+
+class Recording(PointSource):
+    """A sequence of sweeps of one sensor.
+
+    ``len(recording)`` is the number of sweeps, and ``recording[number]`` reads a `Sweep`. Formats
+    implement `load` and ``__len__``, and the methods ``load_...`` for what they store apart from
+    the points.
+    """
+
+    _item = "sweep"
+
+    def load_fired(self, number: int) -> Sweep:
+        """Read a sweep as fired, including its `firing_poses`.
+
+        It is only called if `RecordingInfo.has_firing_poses` is true.
+        """
+        raise NotImplementedError
+
+    def load_stamps(self) -> Iterable[float] | None:
+        """Return the timestamps of all sweeps in nanoseconds, or None if they are unknown."""
+        return None
+
+    def load_poses(self) -> Floats | None:
+        """Return the poses of all sweeps, of shape (n, 4, 4), if they are stored in one place.
+
+        None if a pose is unknown, or if each sweep contains its pose.
+        """
+        return None
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        """Return the boxes of labeled objects in all sweeps, or None if there are no labels."""
+        return None
+
+    def load_classes(self) -> Mapping[int, str]:
+        """Return the names of the semantic classes by number, as far as they are stored."""
+        return {}
+
+    def __repr__(self) -> str:
+        motion = {True: ", motion-compensated", False: ", as fired", None: ""}
+        count = plural(len(self), "sweep")
+        return f"<Recording {self.info.name}: {count}{motion[self.info.compensated]}>"
+
+    def fired(self, number: int) -> Sweep:
+        """Read the returns of a sweep without motion compensation, if possible.
+
+        Each return is then in the sensor frame at the time of its firing. If the recording does not
+        contain such points, the returns are as stored.
+
+        Raises LidarError if the recording cannot be read.
+        """
+        if not self.info.has_firing_poses:
+            return self[number].returns()
+        with reading(self.info.name):
+            return self.standardize(number, self.load_fired(number)).returns()
+
+    def standardize(self, number: int | None, sweep: Sweep) -> Sweep:
+        """Convert a stored sweep like `PointSource.standardize`.
+
+        The recording determines its rings and times if the file does not contain them.
+        """
+        return super().standardize(number, sweep).replace(facts=self, number=number or 0)
+
+    @cached_property
+    def _stored_poses(self) -> Floats | None:
+        with reading(self.info.name):
+            return self.load_poses()
+
+    @property
+    def has_stored_poses(self) -> bool:
+        """Whether all poses are known without reading the sweeps."""
+        return self._stored_poses is not None
 
     def poses(self, numbers: Iterable[int]) -> Floats | None:
         """Return the poses of sweeps in the world frame, or None if a pose is unknown.
@@ -358,18 +431,15 @@ class Recording:
         LidarError
             If the recording cannot be read.
         """
-        if self.read_poses is not None:
-            chosen = list(numbers)
-            with reading(self.name):
-                all_poses = self.read_poses()
-                if all_poses is not None:
-                    matrices = np.array(all_poses[chosen], np.float64).reshape(-1, 4, 4)
-                    _check_poses(matrices, chosen)
-                    matrices[:, :3, 3] *= self.meters
-                    return matrices
-            numbers = chosen
+        chosen = list(numbers)
+        if self._stored_poses is not None:
+            with reading(self.info.name):
+                matrices = np.array(self._stored_poses[chosen], np.float64).reshape(-1, 4, 4)
+                _check_poses(matrices, chosen)
+                matrices[:, :3, 3] *= self.info.meters
+                return matrices
         poses = []
-        for number in numbers:
+        for number in chosen:
             pose = self[number].pose
             if pose is None:
                 return None
@@ -379,29 +449,24 @@ class Recording:
     @cached_property
     def classes(self) -> Mapping[int, str]:
         """Names of the semantic classes by number, as far as the recording states them."""
-        if self.read_classes is None:
-            return {}
-        with reading(self.name):
-            return self.read_classes()
+        with reading(self.info.name):
+            return self.load_classes()
 
     @cached_property
     def boxes(self) -> RecordedBoxes | None:
         """Boxes of labeled objects in all sweeps, or None if the recording has no labels."""
-        if self.read_boxes is None:
-            return None
-        with reading(self.name):
-            return self.read_boxes()
+        with reading(self.info.name):
+            return self.load_boxes()
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
         """Timestamps of the sweeps in nanoseconds, or None if they are unknown.
 
-        The shape is (count,), and the dtype is float64.
+        The shape is (n,), and the dtype is float64.
         """
-        if self.read_stamps is None:
-            return None
-        with reading(self.name):
-            return np.fromiter(self.read_stamps(), np.float64)
+        with reading(self.info.name):
+            stamps = self.load_stamps()
+            return None if stamps is None else np.fromiter(stamps, np.float64)
 
     @property
     def rings(self) -> Rings:
@@ -415,18 +480,18 @@ class Recording:
 
     @cached_property
     def _rings_and_times(self) -> tuple[Rings, PointTimes | None]:
-        numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
+        numbers = even_indices(len(self), _REFERENCE_SWEEPS).tolist()
         # Points are read as fired, because motion compensation changes their elevation angles.
-        sweeps = {number: self.read_fired(number) for number in numbers}
+        sweeps = {number: self.fired(number) for number in numbers}
         sweeps = {number: sweep for number, sweep in sweeps.items() if len(sweep)}
         stamps_s = self.stamps_ns
-        if stamps_s is not None and len(stamps_s) == self.count:
+        if stamps_s is not None and len(stamps_s) == len(self):
             stamps_s = 1e-9 * stamps_s[[*sweeps]]
         else:
             stamps_s = None
         columns = [sweep.columns for sweep in sweeps.values()]
         times = PointTimes.from_sweeps(columns, stamps_s) if columns else None
-        return Rings.from_sweeps(self.name, [*sweeps.values()]), times
+        return Rings.from_sweeps(self.info.name, [*sweeps.values()]), times
 
     def rings_of(self, sweep: Sweep) -> Ints | None:
         """Return the ring of each point in a sweep without a ring column.
@@ -447,7 +512,7 @@ class Recording:
 
         Returns None if the times are unknown, otherwise an array with shape (n,).
         """
-        if self.fired is not None:  # a result, whose times are exact
+        if self.info.has_firing_poses:  # a result, whose times are exact
             if "time" not in sweep.columns or sweep.time_ns is None:
                 return None
             return 1e-9 * (np.asarray(sweep.columns["time"]) - sweep.time_ns)
@@ -458,132 +523,193 @@ class Recording:
         return self.point_times.relative_times(sweep.columns, stamp_s)
 
 
-@dataclass(frozen=True)
-class RecordingSource:
-    """A file or folder to open, with the options that the user chose."""
+# Attributes that are derived from other attributes and from `PointSource.info`.
+_DERIVED = ("_stored_poses", "classes", "boxes", "stamps_ns", "_rings_and_times")
 
-    path: Path
-    name: str  # name in messages
-    sensor: str | None = None  # sensor or topic to read, if there are several
-    intensity: str | None = None  # column to use as intensity, if it is not `intensity`
-    unit: str | None = None  # unit of the positions, which overrides the file
-    # Whether positions are returned in the units and the coordinate system of the file, without
-    # checks, and each scan in the file is an item.
-    as_stored: bool = False
-    # Sensors and topics that the format has selected; empty if it does not distinguish any.
-    selected: set[str] = field(default_factory=set, repr=False, compare=False)
 
-    def recording(self, count: int, read: Callable[[int], Sweep], **fields: Any) -> Recording:
-        """Create a recording with `count` sweeps or parts. `fields` are passed to `Recording`."""
-        fields.setdefault("intensity_column", self.intensity)
-        return Recording(self.name, count, read, **fields)
+class SweepsInMemory(Recording):
+    """Sweeps in memory as a recording.
 
-    def choose(self, kind: str, names: Iterable[str]) -> str:
-        """Return the sensor or topic that the user chose (see the function `choose`)."""
-        chosen = choose(self.name, kind, names, self.sensor)
-        self.selected.add(chosen)
-        return chosen
+    Parameters
+    ----------
+    info
+        What is known about the sweeps, or only their name in messages.
+    sweeps
+        Sweeps with the units and column names that `info` states.
+    stamps_ns
+        Timestamps of the sweeps in nanoseconds, of shape (n,), or None if they are unknown.
+    poses
+        Poses of the sweeps, of shape (n, 4, 4). None to use those of the sweeps.
 
-    def select_sensor(self, sensors: Mapping[str, Recording]) -> Recording:
-        """Return the recording of the chosen sensor.
+    Examples
+    --------
+    >>> SweepsInMemory("drive", [Sweep(np.ones((5, 3)))])
+    <Recording drive: 1 sweep>
+    """
 
-        A single sensor may have an empty name.
-        """
-        name = self.choose("sensors", sensors)
-        return replace(sensors[name], sensor=name)
-
-    def prefix_notes(self, clauses: Iterable[str]) -> tuple[str, ...]:
-        """Turn clauses into notes by prepending the name of the recording."""
-        return tuple(f"{self.name} {clause}" for clause in clauses)
-
-    def chosen_meters(self) -> Meters:
-        """Return the units of x, y and z in meters, for a format that does not define them."""
-        return stated_meters(None, np.zeros((0, 3)), self.unit)[0]
-
-    def stated_meters(
-        self, system: StatedSystem | None, positions: Floats
-    ) -> tuple[Meters, tuple[str, ...]]:
-        """Return the units of x, y and z in meters, and notes for the user.
-
-        `positions` contains points in the file, or a sample of them, in the units of the file.
-        Raises LidarError in the same cases as `lidarsim.scene.files.stated_system.stated_meters`.
-        """
-        if self.as_stored:
-            return METERS, ()
-        meters, clauses = stated_meters(system, positions, self.unit)
-        return meters, self.prefix_notes(clauses)
-
-    def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
-        """Return the EPSG code of a coordinate system, or None if its unit is not the meter."""
-        if system is None or self.unit is not None or meters != METERS:
-            return None
-        return system.epsg
-
-    def stream(
+    def __init__(
         self,
-        sweeps: Callable[[], Iterable[Any]],
-        convert: Callable[[Any], Sweep],
-        count: int | None = None,
-        **fields: Any,
-    ) -> Recording:
-        """Create a recording from a file that can only be read sequentially.
+        info: RecordingInfo | str,
+        sweeps: Sequence[Sweep],
+        *,
+        stamps_ns: Floats | None = None,
+        poses: Floats | None = None,
+    ) -> None:
+        super().__init__(RecordingInfo(info) if isinstance(info, str) else info)
+        self._sweeps = sweeps
+        self._stamps_ns = stamps_ns
+        self._poses = poses
 
-        Reading the sweeps in order takes a single pass. To go back, the file is read again from its
-        start.
+    def __len__(self) -> int:
+        return len(self._sweeps)
 
-        Parameters
-        ----------
-        sweeps
-            Function that returns an iterable of the stored sweeps.
-        convert
-            Function that converts a stored sweep to a `Sweep`.
-        count
-            Number of sweeps. If it is None, the sweeps are counted.
-        fields
-            Further fields of `Recording`.
-        """
-        if count is None:
-            with reading(self.name):
-                count = sum(1 for _ in sweeps())
-        positions = PerProcess(_StreamPosition)
+    def load(self, number: int) -> Sweep:
+        """Return a sweep."""
+        return self._sweeps[number]
 
-        def read(number: int) -> Sweep:
-            position = positions()
-            with position.lock:
-                start = position.next_number
-                position.next_number = 0  # so that the next call starts again after an error
-                if not 0 < start <= number:
-                    start = 0
-                    position.remaining = iter(sweeps())
-                stored = next(islice(position.remaining, number - start, None), None)
-                if stored is None:
-                    raise CutShortError(
-                        f"{plural(count, 'sweep')} were expected, but there are fewer"
-                    )
-                position.next_number = number + 1
-                return convert(stored)
+    def load_stamps(self) -> Floats | None:
+        """Return the timestamps of all sweeps in nanoseconds."""
+        return self._stamps_ns
 
-        def locked(function: Callable[[], Any]) -> Callable[[], Any]:
-            def call() -> Any:
-                with positions().lock:
-                    found = function()
-                    return [*found] if isinstance(found, Iterator) else found
-
-            return call
-
-        for name in ("read_stamps", "read_poses", "read_boxes"):
-            if fields.get(name) is not None:
-                fields[name] = locked(fields[name])
-        return self.recording(count, read, **fields)
+    def load_poses(self) -> Floats | None:
+        """Return the poses of all sweeps."""
+        return self._poses
 
 
-@dataclass
-class _StreamPosition:
-    """Position at which a process reads a stream, protected by a lock."""
+class FileRecording(Recording):
+    """A recording with a file for each sweep. Formats implement `load`.
 
-    next_number: int = 0  # number of the next sweep, or 0 to start again
-    remaining: Iterator[Any] = field(default_factory=lambda: iter(()))  # from `next_number`
-    lock: RLock = field(default_factory=RLock)
+    Parameters
+    ----------
+    info
+        What is known before the points are read.
+    paths
+        Paths of the files in the order of the sweeps.
+    """
+
+    def __init__(self, info: RecordingInfo, paths: Sequence[Path]) -> None:
+        super().__init__(info)
+        self.paths = paths
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+
+class DerivedRecording(Recording):
+    """A recording that is read from another one.
+
+    Subclasses override what they change.
+
+    Parameters
+    ----------
+    source
+        Recording from which sweeps are read.
+    info
+        Description of this recording. By default, that of the source.
+    """
+
+    def __init__(self, source: Recording, info: RecordingInfo | None = None) -> None:
+        super().__init__(source.info if info is None else info)
+        self.source = source
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user, including those about poses that have been read."""
+        return (*self.info.notes, *self.source.notes[len(self.source.info.notes) :])
+
+    def load(self, number: int) -> Sweep:
+        """Read a sweep of the source."""
+        return self.source.load(number)
+
+    def load_fired(self, number: int) -> Sweep:
+        """Read a sweep of the source as fired."""
+        return self.source.load_fired(number)
+
+    def load_stamps(self) -> Iterable[float] | None:
+        """Return the timestamps of the source."""
+        return self.source.stamps_ns
+
+    def load_poses(self) -> Floats | None:
+        """Return the poses of the source."""
+        return self.source._stored_poses
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        """Return the boxes of the source."""
+        return self.source.boxes
+
+    def load_classes(self) -> Mapping[int, str]:
+        """Return the class names of the source."""
+        return self.source.classes
+
+
+class RecordingSection(DerivedRecording):
+    """Consecutive sweeps of a recording.
+
+    Parameters
+    ----------
+    source
+        The recording.
+    first
+        Number of the first sweep.
+    count
+        Number of sweeps.
+    """
+
+    def __init__(self, source: Recording, first: int, count: int) -> None:
+        rows = slice(first, first + count)
+        info = source.info
+        super().__init__(
+            source, replace(info, stations=info.stations[rows], files=info.files[rows])
+        )
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return self._rows.stop - self._rows.start
+
+    def load(self, number: int) -> Sweep:
+        """Read a sweep of the section."""
+        return self.source.load(self._rows.start + number)
+
+    def load_fired(self, number: int) -> Sweep:
+        """Read a sweep of the section as fired."""
+        return self.source.load_fired(self._rows.start + number)
+
+    def load_stamps(self) -> Floats | None:
+        """Return the timestamps of the section."""
+        stamps_ns = self.source.stamps_ns
+        return None if stamps_ns is None else stamps_ns[self._rows]
+
+    def load_poses(self) -> Floats | None:
+        """Return the poses of the section."""
+        poses = super().load_poses()
+        return None if poses is None else poses[self._rows]
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        """Return the boxes of the section."""
+        boxes = self.source.boxes
+        return None if boxes is None else boxes.section(self._rows.start, len(self))
+
+
+class LastRead(DerivedRecording):
+    """A recording whose last sweep stays in memory, so that it is not read again."""
+
+    def __init__(self, source: Recording) -> None:
+        super().__init__(source)
+        self._last: tuple[int, Sweep] | None = None
+
+    def load(self, number: int) -> Sweep:
+        """Read a sweep, unless it is in memory."""
+        if self._last is None or self._last[0] != number:
+            self._last = None  # frees its memory before the next sweep is read
+            self._last = number, self.source.load(number)
+        return self._last[1]
+
+    def release(self) -> None:
+        """Release the sweep in memory."""
+        self._last = None
 
 
 def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
@@ -598,138 +724,3 @@ def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
     for index, axis in enumerate("xyz"):
         points[:, index] = columns.pop(axis)
     return Sweep(points, columns, **fields)
-
-
-def open_cloud(
-    name: str,
-    cloud: CloudLike,
-    load_sweeps: Callable[[], Sweeps] | None,
-    sensor: str | None,
-    intensity: str | None,
-    *,
-    has_measured_poses: bool = False,
-    **fields: Any,
-) -> Recording:
-    """Open a lidarpool cloud as the sweeps of a sensor, or in parts if it has no sweeps.
-
-    Parameters
-    ----------
-    name
-        Name that is used in messages.
-    cloud
-        Cloud to open.
-    load_sweeps
-        Function that returns the sweeps of the cloud, or None for a cloud without sweeps.
-    sensor, intensity
-        Sensor and intensity column that the user chose, or None.
-    has_measured_poses
-        Whether the poses contain the errors of a measured trajectory.
-    fields
-        Further fields of `Recording`.
-
-    Raises
-    ------
-    LidarError
-        If there are several sensors and none was chosen, or if the chosen sensor does not exist.
-    """
-    if sensor and load_sweeps is None:
-        raise LidarError(
-            f"{name} has no sweeps that state their sensor, so no sensor can be selected. Remove "
-            f"the sensor {sensor!r}."
-        )
-    fields |= {"intensity_column": intensity, "noise_classes": None}
-    if load_sweeps is None:
-
-        def read_part(number: int) -> Sweep:
-            chunk = next(cloud.chunks(CHUNK_POINTS, number * CHUNK_POINTS))
-            return Sweep(chunk.positions, chunk.columns)
-
-        parts = -(-len(cloud) // CHUNK_POINTS)
-        return Recording(name, parts, read_part, is_cloud=True, point_count=len(cloud), **fields)
-    saved = load_sweeps()
-    fields["epsg"] = saved.epsg
-    sensor_index = saved.sensors.index(choose(name, "sensors", saved.sensors, sensor))
-    indices = np.flatnonzero(saved.sensor == sensor_index).tolist()
-
-    def read_sweep(number: int) -> Sweep:
-        index = indices[number]
-        points = next(saved.points(cloud, index, index + 1))
-        return Sweep(
-            saved.in_sensor(index, points.positions),
-            points.columns,
-            pose=saved.pose.matrix(index),
-            time_ns=float(saved.begins_ns[index]),
-            sensor=saved.sensors[sensor_index],
-        )
-
-    def read_fired(number: int) -> Sweep:
-        index = indices[number]
-        points = next(saved.points(cloud, index, index + 1))
-        poses = saved.firing_poses(index, points)
-        return Sweep(
-            saved.as_fired(index, points, poses),
-            points.columns,
-            pose=saved.pose.matrix(index),
-            time_ns=float(saved.begins_ns[index]),
-            compensated=False,
-            firing_poses=poses,
-        )
-
-    def read_poses() -> Floats:
-        return np.array([saved.pose.matrix(index) for index in indices])
-
-    stamps_ns = saved.begins_ns[indices] + (saved.start_ns or 0)
-    # The column `intensity` of a result contains energies. Another column may be chosen.
-    fields["energy_unit"] = 1.0 if intensity in (None, "intensity") else None
-    fields["sensor"] = saved.sensors[sensor_index]
-    columns = {column.name for column in cloud.table}
-    if ray_columns := columns & {"time", "ray"}:
-        # `compared_sweep` identifies rays by their time if possible, otherwise by their number.
-        key = max(ray_columns), "return_number" in columns
-        fields["ray_times"] = RayTimes(
-            fingerprint(key, saved.scans[indices], saved.begins_ns[indices]),
-            saved.pose.positions[indices],
-            saved.pose.quaternions[indices],
-            is_measured=has_measured_poses,
-        )
-    if saved.actors:
-        fields["read_boxes"] = lambda: RecordedBoxes.from_sweeps(saved, indices)
-    if len(saved.knots):
-        fields["compensated"] = saved.coordinates == "world"
-    fields |= {"read_stamps": lambda: stamps_ns, "read_poses": read_poses, "fired": read_fired}
-    return Recording(name, len(indices), read_sweep, **fields)
-
-
-def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
-    """Return the chosen sensor or topic, or the only one if none was chosen.
-
-    Parameters
-    ----------
-    name
-        Name of the recording, for error messages.
-    kind
-        What is chosen, in the plural, for error messages. For example "sensors".
-    names
-        Names of the available sensors or topics.
-    chosen
-        Name that the user chose, or None.
-
-    Raises
-    ------
-    LidarError
-        If there are several and none was chosen, or if the chosen one does not exist.
-    """
-    available = list(names)
-    if chosen is None and len(available) == 1:
-        return available[0]
-    if chosen is not None and chosen in available:
-        return chosen
-    contents = f"It contains the {kind} {join_names(available)}." if available else ""
-    if available == [""]:
-        contents = f"Its {kind} have no names and cannot be selected."
-    if not available:
-        raise LidarError(f"{name} contains no {kind}. Record at least one.")
-    if chosen is None:
-        raise SeveralSensorsError(f"{name} contains the {kind} {join_names(available)}.", available)
-    hint = did_you_mean(chosen, available)
-    raise LidarError(f"{name} does not contain {chosen!r}.{hint} {contents}")

@@ -29,7 +29,8 @@ from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange, as_npy
 from .point_field import PointField
-from .recording import Recording, RecordingSource
+from .recording import Recording, RecordingInfo
+from .recording_ref import RecordingRef
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
@@ -189,13 +190,25 @@ class WebDataset(MultiFileFormat):
         return arrays.pop("points"), arrays
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open the samples in a tar file, or in all tar files in a folder."""
-        path = source.path
+        path = ref.path
         files = sort_by_number(path.rglob("*.tar")) if path.is_dir() else [path]
-        with reading(source.name):
-            sensors = _sensors(source, files)
-        return source.select_sensor(sensors)
+        with reading(ref.name):
+            sensors = _samples_of_sensors(files)
+        name, samples = ref.choose_sensor(sensors)
+        notes = []
+        if not path.is_dir() and (count := len([*path.absolute().parent.glob("*.tar")])) > 1:
+            notes.append(
+                f"is one of {count} tar files in its folder. Specify the folder to read all sweeps"
+            )
+        stated = {sample.compensated for sample in samples}
+        info = ref.info(
+            sensor=name,
+            compensated=stated.pop() if len(stated) == 1 else None,
+            notes=ref.prefix_notes(notes),
+        )
+        return _WebRecording(info, samples)
 
 
 def _offsets(job: JobReader) -> Ints:
@@ -238,8 +251,8 @@ class _Sample(NamedTuple):
         return Sweep(points, arrays, pose=pose, time_ns=self.time_ns, compensated=self.compensated)
 
 
-def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:
-    """Open the samples in tar files, keyed by sensor.
+def _samples_of_sensors(files: list[Path]) -> dict[str, list[_Sample]]:
+    """Return the samples in tar files, keyed by sensor.
 
     A sample consists of ``KEY.points.npy``, and optionally ``KEY.json`` and further arrays. Raises
     LidarError if no sample has points.
@@ -258,29 +271,25 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
             f"{files[0].name} contains no point samples. A WebDataset with sweeps must contain "
             "files named KEY.points.npy."
         )
+    return samples_of_sensor
 
-    notes = []
-    if (
-        not source.path.is_dir()
-        and (count := len([*source.path.absolute().parent.glob("*.tar")])) > 1
-    ):
-        notes.append(
-            f"is one of {count} tar files in its folder. Specify the folder to read all sweeps"
-        )
 
-    def recording(samples: list[_Sample]) -> Recording:
-        times = [sample.time_ns for sample in samples]
-        times_ns = None if None in times else np.array(times, np.float64)
-        stated = {sample.compensated for sample in samples}
-        return source.recording(
-            len(samples),
-            lambda number: samples[number].read(),
-            read_stamps=None if times_ns is None else times_ns.tolist,
-            compensated=stated.pop() if len(stated) == 1 else None,
-            notes=source.prefix_notes(notes),
-        )
+class _WebRecording(Recording):
+    """Samples of one sensor."""
 
-    return {sensor: recording(samples) for sensor, samples in samples_of_sensor.items()}
+    def __init__(self, info: RecordingInfo, samples: list[_Sample]) -> None:
+        super().__init__(info)
+        self._samples = samples
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def load(self, number: int) -> Sweep:
+        return self._samples[number].read()
+
+    def load_stamps(self) -> list[float] | None:
+        times_ns = [sample.time_ns for sample in self._samples if sample.time_ns is not None]
+        return times_ns if len(times_ns) == len(self) else None
 
 
 def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:

@@ -100,6 +100,7 @@ def _ranks() -> tuple[int, int]:
 def tensors(sweep: Sweep) -> dict[str, Any]:
     """Convert a sweep to a dictionary of tensors, as `SavedSweeps.torch` describes."""
     boxes = sweep.boxes
+    assert boxes is not None  # all sweeps of data sets have boxes
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array
         for name, array in sweep.columns.items()

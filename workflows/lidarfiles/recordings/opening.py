@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.io.input_files import read_input
-from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.words import join_names
 
 from ..clouds.format_table import format_of_path, formats_of_endings
-from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
+from ..clouds.recording import PointCloud, Recording, RecordingInfo
+from ..clouds.recording_ref import RecordingRef, SeveralSensorsError
+from ..clouds.results import open_cloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
 from ..parts.parts import StoredCloud
@@ -47,6 +49,7 @@ _CONVERSIONS = {  # {ending of an unsupported format: advice}
         "or use `lidarpool compare CLOUD MESH --survey mesh` to compare a cloud with it.",
     ),
 }
+_MAX_OPENED = 4  # number of recordings that a process keeps open
 # Extensions of files for which the user can set the unit.
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))
 
@@ -62,7 +65,9 @@ class UnknownFormatError(LidarError):
         self.advice = advice
 
 
-def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
+def open_sensors(
+    source: str | Path, *, keep_noise: bool = False
+) -> dict[str, Recording | PointCloud]:
     """Open the recordings of all sensors or topics as {name: recording}.
 
     The name is empty if a single sensor has no name. If the source contains several sequences,
@@ -73,17 +78,17 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
     opened = partial(open_recording, source, keep_noise=keep_noise)
     try:
         recording = opened()
-        return {recording.sensor: recording}
+        return {recording.info.sensor: recording}
     except SeveralSensorsError as error:
         recordings = {name: opened(sensor=name) for name in error.names}
-    sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
+    sequences = list(dict.fromkeys(opened.info.sequence for opened in recordings.values()))
     if len(sequences) == 1:
         return recordings
     note = f"Only {sequences[0]}, the first of {len(sequences):,} sequences, is shown."
     return {
-        name: replace(recording, notes=(*recording.notes, note))
+        name: recording.with_info(notes=(*recording.info.notes, note))
         for name, recording in recordings.items()
-        if recording.sequence == sequences[0]
+        if recording.info.sequence == sequences[0]
     }
 
 
@@ -95,7 +100,7 @@ def open_recording(
     name: str = "the cloud",
     unit: str | None = None,
     keep_noise: bool = False,
-) -> Recording:
+) -> Recording | PointCloud:
     """Open a recording or cloud in any format, and read it sweep by sweep.
 
     Parameters
@@ -117,9 +122,10 @@ def open_recording(
 
     Returns
     -------
-    Recording
-        A sequence of `Sweep` objects, which are read when they are accessed. Large clouds without
-        sweeps are divided into parts.
+    Recording or PointCloud
+        A sequence of `Sweep` objects, which are read when they are accessed. They are the sweeps
+        of a recording, or the parts of a cloud without sweeps. If the source is a file or folder,
+        it can be pickled, and each process that receives it opens the file.
 
     Raises
     ------
@@ -132,29 +138,61 @@ def open_recording(
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
             raise LidarError(f"{name} is always in meters. Remove the unit {unit!r}.")
-        return open_cloud(name, source, source.sweeps, sensor, intensity)
+        info = RecordingInfo(name, intensity_column=intensity)
+        return open_cloud(info, source, source.sweeps, sensor)
     path = Path(source)
-    name = str(source)
-    if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
-        raise LidarError(
-            f"{name} is always in meters. Remove the unit {unit!r}, which can only be set for "
-            f"{join_names(_UNIT_SUFFIXES)} files."
-        )
-    opened = RecordingSource(path, name, sensor, intensity, unit)
-    recording = replace(_open_path(opened), world_origin=_world_origin(path))
-    if sensor and not opened.selected:
-        raise LidarError(
-            f"{name} does not name its sensor, so no sensor can be selected. Remove the sensor "
-            f"{sensor!r}."
-        )
-    return replace(recording, noise_classes=None) if keep_noise else recording
+    return _open(RecordingRef(path, sensor, intensity, unit, keep_noise, name=str(source)))
+
+
+def open_ref(ref: RecordingRef) -> Recording | PointCloud:
+    """Open a file or folder, unless this process has opened it recently.
+
+    A file is opened again if its size or its modification time has changed.
+
+    Raises the same errors as `open_recording`.
+    """
+    # A forked process must not share open files with its parent.
+    process = os.getpid()
+    key = process, ref, _file_state(ref.located.path)
+    opened = _opened.pop(key, None)
+    if opened is None:
+        opened = _open(ref)
+    _opened[key] = opened
+    own = [entry for entry in list(_opened) if entry[0] == process]
+    for entry in own[:-_MAX_OPENED]:
+        _opened.pop(entry, None)
+    return opened
+
+
+def close_recordings() -> None:
+    """Close the recordings that `open_ref` keeps open in this process."""
+    for entry in list(_opened):
+        if entry[0] == os.getpid():
+            _opened.pop(entry, None)
+
+
+def sensor_refs(ref: RecordingRef) -> tuple[RecordingRef, ...]:
+    """Return a reference for each sensor of a recording, or only for the chosen sensor.
+
+    The sequences of a KITTI data set count as sensors.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read.
+    """
+    try:
+        open_ref(ref)
+    except SeveralSensorsError as error:
+        return tuple(replace(ref, sensor=name) for name in error.names)
+    return (ref,)
 
 
 def as_recording(
-    recording: str | Path | Cloud | StoredCloud | Recording,
+    recording: str | Path | Cloud | StoredCloud | Recording | PointCloud,
     sensor: str | None = None,
     intensity: str | None = None,
-) -> Recording:
+) -> Recording | PointCloud:
     """Return a recording, or open a source like `open_recording`.
 
     Raises
@@ -163,52 +201,92 @@ def as_recording(
         In the same cases as `open_recording`, or if the recording is open, so that its sensor and
         its intensity column can no longer be chosen.
     """
-    if not isinstance(recording, Recording):
+    if not isinstance(recording, Recording | PointCloud):
         return open_recording(recording, sensor, intensity, name="the recording")
     for name, value in (("sensor", sensor), ("intensity", intensity)):
         if value is not None:
             raise LidarError(
-                f"{recording.name} is already open. Pass `{name}` to `open_recording` instead."
+                f"{recording.info.name} is already open. Pass `{name}` to `open_recording` instead."
             )
     return recording
 
 
-def _world_origin(path: Path) -> Floats | None:
+def with_sweeps(source: Recording | PointCloud) -> Recording:
+    """Return a recording, or raise LidarError if it contains no sweeps."""
+    if isinstance(source, PointCloud) or not len(source):
+        raise LidarError(
+            f"{source.info.name} contains no sweeps. Use a recording that consists of sweeps."
+        )
+    return source
+
+
+_FileState = tuple[int, int] | None  # size and modification time in nanoseconds
+_opened: dict[tuple[int, RecordingRef, _FileState], Recording | PointCloud] = {}
+
+
+def _file_state(path: Path) -> _FileState:
+    try:
+        status = path.stat()
+    except OSError:  # opening it raises the error
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
+def _open(ref: RecordingRef) -> Recording | PointCloud:
+    located = ref.located
+    path, name = located.path, located.name
+    if ref.unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
+        raise LidarError(
+            f"{name} is always in meters. Remove the unit {ref.unit!r}, which can only be set for "
+            f"{join_names(_UNIT_SUFFIXES)} files."
+        )
+    opened = _open_path(located)
+    if ref.sensor and opened.info.sensor != ref.sensor:
+        raise LidarError(
+            f"{name} does not name its sensor, so no sensor can be selected. Remove the sensor "
+            f"{ref.sensor!r}."
+        )
+    changes: dict[str, Any] = {"noise_classes": None} if ref.keep_noise else {}
+    opened = opened.with_info(world_origin=_world_origin(path), **changes)
+    return opened.reopened_by(partial(open_ref, ref))
+
+
+def _world_origin(path: Path) -> tuple[float, float, float] | None:
     """Return the origin that was added to the points of a result, or None if nothing was added."""
     folder = path if path.is_dir() else path.parent
     try:
         report = json.loads(read_input(folder / "report.json"))
-        origin = np.array(report["parameters"]["world_origin"], np.float64)
+        x, y, z = map(float, report["parameters"]["world_origin"])
     except (OSError, ValueError, TypeError, LookupError, LidarError):
         return None
-    return origin if origin.shape == (3,) and origin.any() else None
+    return (x, y, z) if any((x, y, z)) else None
 
 
-def _open_path(source: RecordingSource) -> Recording:
-    path = source.path
+def _open_path(ref: RecordingRef) -> Recording | PointCloud:
+    path = ref.path
     if not path.exists():
-        raise MissingFileError(f"{source.name} does not exist. Specify {KINDS}.")
+        raise MissingFileError(f"{ref.name} does not exist. Specify {KINDS}.")
     if path.is_file() and not path.stat().st_size:
-        raise LidarError(f"{source.name} is empty (0 bytes). Specify {KINDS}.")
+        raise LidarError(f"{ref.name} is empty (0 bytes). Specify {KINDS}.")
     if (path / INDEX_FILE).exists():
-        return _open_data_set(source)
-    if (cloud_format := format_of_path(path, source.name)) is not None:
-        return cloud_format.open(source)
+        return _DataSetRecording(ref)
+    if (cloud_format := format_of_path(path, ref.name)) is not None:
+        return cloud_format.open(ref)
     if path.is_dir() and any(_is_bag_file(file) for file in path.iterdir()):
         raise UnknownFormatError(
-            source.name,
+            ref.name,
             "It contains files of a ROS 2 bag, but not the file metadata.yaml. Create it with "
             "`ros2 bag reindex`, or specify one of the .mcap files.",
         )
     if path.is_dir() and (endings := sorted({file.suffix.lower() for file in _point_files(path)})):
         raise UnknownFormatError(
-            source.name,
+            ref.name,
             f"It contains {join_names(endings)} files, which are not read as the sweeps of a "
             "recording. Specify one of the files, or store the sweeps as .pcd files in a folder.",
         )
     file_name = path.name.lower()
     advice = (text for ending, text in _CONVERSIONS.items() if file_name.endswith(ending))
-    raise UnknownFormatError(source.name, next(advice, ""))
+    raise UnknownFormatError(ref.name, next(advice, ""))
 
 
 def _is_bag_file(file: Path) -> bool:
@@ -221,13 +299,25 @@ def _point_files(folder: Path) -> list[Path]:
     return [file for file in folder.iterdir() if file.suffix.lower() in endings and file.is_file()]
 
 
-def _open_data_set(source: RecordingSource) -> Recording:
-    saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
-    source.selected.add(source.sensor or "")
-    return source.recording(
-        len(saved),
-        saved.__getitem__,
-        compensated=saved.are_compensated(),
-        fired=saved.read_fired if saved.have_firing_poses() else None,
-        noise_classes=None,
-    )
+class _DataSetRecording(Recording):
+    """The sweeps of a data set of lidarpool."""
+
+    def __init__(self, ref: RecordingRef) -> None:
+        self._saved = sweeps(ref.path, sensors=None if ref.sensor is None else [ref.sensor])
+        super().__init__(
+            ref.info(
+                sensor=ref.sensor or "",
+                compensated=self._saved.are_compensated(),
+                has_firing_poses=self._saved.have_firing_poses(),
+                noise_classes=None,
+            )
+        )
+
+    def __len__(self) -> int:
+        return len(self._saved)
+
+    def load(self, number: int) -> Sweep:
+        return self._saved[number]
+
+    def load_fired(self, number: int) -> Sweep:
+        return self._saved.read_fired(number)

@@ -300,9 +300,9 @@ def augment(
         )
     placements = _placements(settings)
     print_first_step("reading the recording", quiet=quiet)
+    from lidarfiles.clouds.recording_ref import RecordingRef
     from lidarfiles.processes.freed_memory import keep_freed_memory
     from lidarreal.augmentation.running import Augmentation
-    from lidarreal.augmentation.sweep_tasks import RecordingFile
 
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
@@ -310,7 +310,7 @@ def augment(
     keep_freed_memory()
     terminal = Terminal(quiet, False, as_json)
     augmentation = Augmentation(
-        RecordingFile(recording, topic, intensity),
+        RecordingRef(recording, topic, intensity),
         _variants(effects, placements, terminal, settings, allow_empty=sensor is not None),
         None if model is None else _load_model(model),
         sweeps,

@@ -345,10 +345,10 @@ def _show_coverage(
     scene_frame = StatedFrame.from_epsg(
         prepared.survey.epsg, f"the scene of {scenario.source}", next(filter(None, heights), "")
     )
-    cloud_frame = StatedFrame.from_recording(recording, recording.name)
+    cloud_frame = StatedFrame.from_recording(recording, recording.info.name)
     more = [*check_same_systems([cloud_frame, scene_frame]), *recording.omission_notes]
     sweeps = PosedSweeps(recording)
-    clouds = (compared_in_world(sweeps, number).points for number in range(recording.count))
+    clouds = (compared_in_world(sweeps, number).points for number in range(len(recording)))
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             prepared.scene,

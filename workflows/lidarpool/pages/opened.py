@@ -176,12 +176,14 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
     """
     if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
         return None
+    from lidarfiles.clouds.recording import PointCloud
     from lidarfiles.recordings.opening import open_recording
 
     from . import recorded
 
     recording = open_recording(path, keep_noise=keep_noise)
-    if recording.sample is None or (recording.point_count or 0) < recorded.LARGE_POINTS:
+    is_large = (recording.info.point_count or 0) >= recorded.LARGE_POINTS
+    if not isinstance(recording, PointCloud) or not is_large:
         return None
     title = f"{path.resolve().name} - lidarpool"
     return recorded.growing_view(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.column_names import COLORS, with_standard_names
 from lidarsim.columns.sweep import Sweep
@@ -97,7 +97,7 @@ def _describe_column(name: str, values: AnyArray) -> Column:
 
 
 def recorded_view(
-    sensors: Mapping[str, Recording],
+    sensors: Mapping[str, Recording | PointCloud],
     title: str,
     downloads: DownloadFormats | None,
     on_part: OnPart = lambda *_: None,
@@ -123,13 +123,14 @@ def recorded_view(
     first = next(iter(sensors.values()))
     further_notes: list[str] = []
     labeled: list[LabeledObject] = []
-    if first.is_cloud:
+    if isinstance(first, PointCloud):
         cloud = _read_cloud(first, on_part)
         sweeps = None
     else:
-        cloud, sweeps, further_notes = _read_sweeps(sensors)
+        recordings = {k: one for k, one in sensors.items() if isinstance(one, Recording)}
+        cloud, sweeps, further_notes = _read_sweeps(recordings)
         try:
-            labeled = _labeled_objects([*sensors.values()], sweeps)
+            labeled = _labeled_objects([*recordings.values()], sweeps)
         except LidarError as error:
             further_notes.append(f"Labeled boxes are not shown. {error}")
     notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
@@ -137,12 +138,12 @@ def recorded_view(
     notes += [note for recording in sensors.values() for note in recording.omission_notes]
     if not len(cloud):
         left_out = "".join(f" {note}." for note in first.omission_notes)
-        raise LidarError(f"{first.name} contains no points.{left_out}")
+        raise LidarError(f"{first.info.name} contains no points.{left_out}")
     names: dict[str, Sequence[str]] = {}
-    if first.name.lower().endswith((".las", ".laz")):
+    if first.info.name.lower().endswith((".las", ".laz")):
         names["class"] = ASPRS_CLASSES
     if sweeps is not None and sweeps.station_numbers.any():
-        names[STATION.name] = _station_names(first, sweeps)
+        names[STATION.name] = _station_names(first.info.stations, sweeps)
     return View(
         ScanOrderedPoints(cloud),
         None,
@@ -151,7 +152,7 @@ def recorded_view(
         title,
         downloads=downloads,
         names=names,
-        stated_epsg=first.epsg,
+        stated_epsg=first.info.epsg,
         labeled_objects=labeled,
     )
 
@@ -187,11 +188,11 @@ def _labeled_objects(sensors: Sequence[Recording], sweeps: Sweeps) -> list[Label
                 quaternions_of(poses[:, :3, :3]),
                 (float(times_ns[0]), float(ends_ns[boxes.sweep[rows[-1]]])),
             )
-            objects.setdefault((recording.sequence, number), labeled)
+            objects.setdefault((recording.info.sequence, number), labeled)
     return [*objects.values()]
 
 
-def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
+def _station_names(stations: Sequence[str], sweeps: Sweeps) -> list[str]:
     """Return the station names, indexed by station number.
 
     Number 0 means that there is no station. Unnamed stations have empty names.
@@ -199,34 +200,35 @@ def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
     numbers = sweeps.station_numbers.tolist()
     names = [""] * (max(numbers) + 1)
     # Some stations may not have been read.
-    for number, name in zip(numbers, recording.stations, strict=False):
+    for number, name in zip(numbers, stations, strict=False):
         names[number] = names[number] or name
     return names
 
 
-def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
-    """Return a view of a sample of a cloud, and the points in this sample.
-
-    The recording must have `Recording.sample`. The sample consists of runs of consecutive points,
-    which are read within a second.
-    """
-    sample = finite_points(recording.read_sample(_SAMPLE_POINTS))
-    view = View(
+def sampled_view(cloud: PointCloud, sample: Sweep, title: str) -> View:
+    """Return a view of a sample of a cloud."""
+    return View(
         InMemoryPoints(merge_sweeps([sample])),
-        note=" ".join(recording.notes),
+        note=" ".join(cloud.notes),
         title=title,
         names={"class": ASPRS_CLASSES},
-        stated_epsg=recording.epsg,
+        stated_epsg=cloud.info.epsg,
     )
-    return view, sample
 
 
 def growing_view(
-    recording: Recording, title: str, read: Callable[[OnPart], View]
-) -> ProgressiveView:
-    """Return a view that first shows a sample of a cloud. `read` adds further points."""
-    total = recording.point_count or 0
-    sampled, sample = sampled_view(recording, title)
+    cloud: PointCloud, title: str, read: Callable[[OnPart], View]
+) -> ProgressiveView | None:
+    """Return a view that first shows a sample of a cloud. `read` adds further points.
+
+    The sample consists of runs of consecutive points, which are read within a second. Returns None
+    if the format of the cloud has no samples.
+    """
+    sampled = cloud.sample(_SAMPLE_POINTS)
+    if sampled is None:
+        return None
+    sample = finite_points(sampled)
+    total = cloud.info.point_count or 0
     parts = [sample]
     step = -(-total // _GROWING_POINTS)
 
@@ -237,12 +239,12 @@ def growing_view(
 
         return read(on_part)
 
-    return ProgressiveView(sampled, total, grow)
+    return ProgressiveView(sampled_view(cloud, sample, title), total, grow)
 
 
-def _read_cloud(recording: Recording, on_part: OnPart) -> Cloud:
+def _read_cloud(recording: PointCloud, on_part: OnPart) -> Cloud:
     """Read a cloud, or evenly spaced points of it if it is large."""
-    total = recording.point_count or 0
+    total = recording.info.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
     parts: list[Sweep] = []
     for number in range(len(recording)):
@@ -294,7 +296,7 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
     count = 0
     for timed in ordered:
         recording = recordings[timed.sensor]
-        if are_combined or recording.read_poses is None:
+        if are_combined or not recording.has_stored_poses:
             sweep = posed[timed.sensor].read(timed.number)
         else:
             sweep = recording[timed.number].returns()
@@ -308,7 +310,7 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
     notes = [f"{note}." for sweeps in posed for note in sweeps.notes]
     if len(poses) < len(ordered):
         notes.append(f"Only the first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
-    are_stations = all(recording.stations for recording in recordings)
+    are_stations = all(recording.info.stations for recording in recordings)
     if not is_timed and len(ordered) > 1 and not are_stations:
         notes.append("The recording contains no times. A rate of 10 sweeps per second is assumed.")
     counts = [len(sweep) for sweep in read]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import with_sweeps
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
-from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Integers, Ints, to_writable
 from lidarsim.pulses.returns import PulseReturns
 from lidarsim.pulses.steps.step import RecordedPulses
@@ -66,11 +66,7 @@ class Augmenter:
         model: Sensor | None = None,
         reflectance: float | None = None,
     ) -> None:
-        if recording.is_cloud or not len(recording):
-            raise LidarError(
-                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
-            )
-        self.recording = recording
+        self.recording = with_sweeps(recording)
         self.effects = effects
         self.motion = SensorMotion.from_recording(
             recording, has_objects=bool(effects.actors or effects.insertions)

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.parts.parts import StoredCloud, pack
 from lidarsim.columns.column_names import COLORS, TIMES
@@ -59,31 +60,6 @@ _FRAMES = {True: COMPENSATED, False: AS_FIRED, None: UNKNOWN_MOTION}  # of the s
 _DERIVED = ("range", "azimuth", "elevation")  # columns that follow from the positions
 
 
-def open_converter(
-    source: str | Path, recording: Recording, spec: ExportSpec, sensor: str | None = None
-) -> FormatConverter:
-    """Return the converter that writes an augmented recording in another format.
-
-    Parameters
-    ----------
-    source
-        File or folder of the recording.
-    recording
-        The recording, opened with `keep_noise=True`.
-    spec
-        Format to write.
-    sensor
-        Sensor or topic that the user chose, or None if there is only one.
-
-    Raises
-    ------
-    LidarError
-        If the format requires columns that recordings do not contain.
-    """
-    opened = RecordingSource(Path(source), str(source), sensor, recording.intensity_column)
-    return FormatConverter(opened, recording, spec)
-
-
 class FormatConverter(Rewriter):
     """Writer of an augmented recording in any export format.
 
@@ -93,8 +69,8 @@ class FormatConverter(Rewriter):
 
     Parameters
     ----------
-    source
-        File or folder of the recording.
+    ref
+        Reference to the recording, whose path is valid in this process.
     recording
         The recording, opened with `keep_noise=True`.
     spec
@@ -108,9 +84,9 @@ class FormatConverter(Rewriter):
 
     title = "Conversion"
 
-    def __init__(self, source: RecordingSource, recording: Recording, spec: ExportSpec) -> None:
-        super().__init__(source, recording)
-        if spec.cloud_format.supports("compensated") and recording.compensated:
+    def __init__(self, ref: RecordingRef, recording: Recording, spec: ExportSpec) -> None:
+        super().__init__(ref, recording)
+        if spec.cloud_format.supports("compensated") and recording.info.compensated:
             spec = replace(spec, compensated=True)
         self.spec = spec
         known = {"scan", *_NEUTRAL, *_KEPT, *_DERIVED}
@@ -130,12 +106,12 @@ class FormatConverter(Rewriter):
     def _intensity_scale(self) -> _IntensityScale:
         numbers = even_indices(len(self.recording), _REFERENCE_SWEEPS).tolist()
         sweeps = [self.recording[number] for number in numbers]
-        return _IntensityScale.from_sweeps(sweeps, energies=self.recording.energies)
+        return _IntensityScale.from_sweeps(sweeps, energies=self.recording.info.energies)
 
     @cached_property
     def _poses(self) -> Floats | None:
         """Poses of all sweeps, or None if each sweep contains its pose."""
-        if self.recording.read_poses is None:
+        if not self.recording.has_stored_poses:
             return None
         return self.recording.poses(range(len(self.recording)))
 
@@ -304,7 +280,7 @@ class FormatConverter(Rewriter):
         notes = self._notes(summary, needed)
         placed = (note for details in encoded.details() for note in details["notes"])
         notes += [f"{note}." for note in dict.fromkeys(placed)]
-        empty = spec.describe_empty_fields(cloud, sweeps, source=self.source.name)
+        empty = spec.describe_empty_fields(cloud, sweeps, source=self.ref.name)
         notes += [f"{spec.title} {text}." for text in empty]
         if unsupported:
             notes.append(f"{spec.title} cannot store {join_names(unsupported)}.")
@@ -354,14 +330,14 @@ class FormatConverter(Rewriter):
             actor_leaves=np.zeros_like(actors.present),
             coordinates="sensor" if self._in_sensor else "world",
             precision_m=self._precision_m,
-            epsg=None if self._in_sensor else self.recording.epsg,
+            epsg=None if self._in_sensor else self.recording.info.epsg,
             start_ns=epoch_ns if epoch_ns is not None and epoch_ns > _MIN_EPOCH_NS else None,
             lidars=(LidarTraits(summary.channels, mode=""),),
-            stated_frame=_FRAMES[self.recording.compensated],
+            stated_frame=_FRAMES[self.recording.info.compensated],
         )
 
     def _notes(self, summary: _Summary, needed: set[str]) -> list[str]:
-        name = self.source.name
+        name = self.ref.name
         notes = []
         if summary.without_pose:
             which = "" if summary.without_pose == len(summary.rows) else " of some sweeps"

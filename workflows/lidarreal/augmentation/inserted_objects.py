@@ -77,8 +77,8 @@ class InsertedObjects:
         notes = []
         if motion.poses is None:
             notes.append(
-                f"The poses of {recording.name} are unknown, so inserted objects move with the "
-                "sensor."
+                f"The poses of {recording.info.name} are unknown, so inserted objects move with "
+                "the sensor."
             )
         first_pose = np.eye(4) if motion.poses is None else motion.poses[0]
         ground = GroundPlane.from_sweep(recording[0]) if effects.insertions else None
@@ -89,7 +89,7 @@ class InsertedObjects:
         for number, insertion in enumerate(effects.insertions):
             assert ground is not None
             mesh = replace(insertion.mesh, name=names[number], animation=None)
-            pose = first_pose @ _sensor_pose(insertion, mesh, ground, recording.name)
+            pose = first_pose @ _sensor_pose(insertion, mesh, ground, recording.info.name)
             placed[number] = pose
             notes += _position_notes(mesh, pose, sensor_positions)
             vertices = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -338,9 +338,9 @@ def _classes(
     if not unknown or "class" not in recording[0].columns:
         return tuple(result), []
     note = (
-        f"{recording.name} does not state the numbers of its classes, so the points of the class "
-        f"{join_names(sorted({*unknown}))} have class 0. Pass a number, for example `--class 10`, "
-        "or set `classes` in an effects file."
+        f"{recording.info.name} does not state the numbers of its classes, so the points of the "
+        f"class {join_names(sorted({*unknown}))} have class 0. Pass a number, for example `--class "
+        "10`, or set `classes` in an effects file."
     )
     return tuple(result), [note]
 

@@ -76,15 +76,10 @@ class RecordedReturns(NamedTuple):
         LidarError
             If the recording has no sweeps or no returns, or if it cannot be read.
         """
-        if recording.is_cloud:
-            raise LidarError(
-                f"{recording.name} is a cloud without sweeps, so the ranges of its returns are "
-                "unknown. Use a recording with sweeps."
-            )
         sweeps = [recording[number].returns() for number in reference_numbers(recording)]
         sweeps = [sweep for sweep in sweeps if len(sweep)]
         if not sweeps:
-            raise LidarError(f"{recording.name} has no returns in the sweeps that were read.")
+            raise LidarError(f"{recording.info.name} has no returns in the sweeps that were read.")
         names = [name for name in sweeps[0].columns if all(name in s.columns for s in sweeps)]
         kept = [even_indices(len(sweep), _MAX_RETURNS // len(sweeps)) for sweep in sweeps]
         pairs = [*zip(sweeps, kept, strict=True)]

@@ -376,9 +376,9 @@ def _primary_column(recording: Recording, returns: RecordedReturns, model: Senso
     if not available:
         raise _unknown_error(recording, "", None)
     intensity, reflectivity = STRENGTHS
-    if available != [intensity, reflectivity] or recording.intensity_column is not None:
+    if available != [intensity, reflectivity] or recording.info.intensity_column is not None:
         return available[0]
-    is_stated = recording.energy_unit is not None or recording.white is not None
+    is_stated = recording.info.energy_unit is not None or recording.info.white is not None
     if is_stated or _has_simulated_energies(returns):
         return intensity
     is_calibrated = model is not None or _is_ouster(columns)
@@ -446,13 +446,13 @@ def _unmeasured(recording: Recording) -> str:
     numbers = reference_numbers(recording)
     lacks = [not {*STRENGTHS} & {*recording[number].columns} for number in numbers]
     if all(lacks) or True not in lacks:
-        return recording.name
+        return recording.info.name
     return _differing_sweep(recording, numbers[lacks.index(True)])
 
 
 def _differing_sweep(recording: Recording, number: int) -> str:
-    item = recording.files[number] if recording.files else f"sweep {number}"
-    return f"Unlike other sweeps, {item} in {recording.name}"
+    item = recording.info.files[number] if recording.info.files else f"sweep {number}"
+    return f"Unlike other sweeps, {item} in {recording.info.name}"
 
 
 def check_column(recording: Recording, sweep: Sweep, number: int, column: str) -> None:
@@ -471,9 +471,9 @@ def _unknown_error(
     if values is None:
         problem = f"{_unmeasured(recording)} has no intensity column"
     elif not len(values):
-        problem = f"The column {column!r} of {recording.name} has no valid intensities"
+        problem = f"The column {column!r} of {recording.info.name} has no valid intensities"
     else:
-        problem = f"All intensities of {recording.name} are {values[0]:g}"
+        problem = f"All intensities of {recording.info.name} are {values[0]:g}"
     return UnknownIntensitiesError(f"{problem}, so the energies of its returns are unknown.")
 
 
@@ -510,7 +510,7 @@ class _Fit:
         """Return the scale if it is known, otherwise None."""
         recording = self.recording
         quantization = common.quantization
-        unit = recording.energy_unit
+        unit = recording.info.energy_unit
         if unit is None and _has_simulated_energies(self.returns):
             unit = 1.0
         if unit is not None and self.column == "intensity":
@@ -521,11 +521,11 @@ class _Fit:
             return replace(common, compensated=False, white=unit, quantization=limits)
         maker = "velodyne" if self.model is None else self.model.optics.reflectivity
         codes = SCALES[maker]
-        if recording.white is not None:
+        if recording.info.white is not None:
             scale = common.with_codes(codes)
-            if quantization.is_byte and scale.white == recording.white:
+            if quantization.is_byte and scale.white == recording.info.white:
                 return scale
-            return replace(common, white=recording.white)
+            return replace(common, white=recording.info.white)
         if self.model is None or self._law(values, quantization) is False:
             return None
         if quantization.is_byte or quantization.is_unit_byte:
@@ -560,7 +560,7 @@ class _Fit:
         unsaturated = values < scale.quantization.max_value
         levels = _levels(scale, values[unsaturated], range_m[unsaturated])
         near = NearFactors.from_returns(levels, self.returns.select(unsaturated))
-        sentences = [f"The intensity scale of {self.recording.name} is unknown.", text]
+        sentences = [f"The intensity scale of {self.recording.info.name} is unknown.", text]
         if near.range_m:
             sentences.append(
                 f"Intensities decrease at ranges below {near.range_m[-1]:g} m, which was "

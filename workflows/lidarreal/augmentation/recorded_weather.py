@@ -39,7 +39,7 @@ def weather_note(recording: Recording, pattern: ScanPattern, motion: SensorMotio
     if share < _MAX_ISOLATED:
         return ""
     return (
-        f"{100 * share:.2g} % of the returns within {_NEAR_M:g} m in {recording.name} are "
+        f"{100 * share:.2g} % of the returns within {_NEAR_M:g} m in {recording.info.name} are "
         "isolated, as in rain, snow or fog. Effects are added to the weather of the recording."
     )
 

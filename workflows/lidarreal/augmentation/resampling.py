@@ -84,13 +84,13 @@ class SensorResampler:
 
     Examples
     --------
-    >>> from lidarpool import Pose, Scanner, Scene, box
+    >>> from lidarpool import Pose, Scanner, Scene, SweepsInMemory, box
     >>> room = Scene.from_meshes([box("Room", (30, 20, 4))])
     >>> recorded = Sensor.grid(720, 32, vertical_fov_deg=30)
     >>> scanner = Scanner(room, recorded, columns=["channel"], coordinates="sensor")
     >>> cloud = scanner.sweep(Pose([0, 0, 2]))
     >>> sweep = Sweep(cloud.positions, {"channel": cloud["channel"]})
-    >>> recording = Recording("drive", 1, lambda number: sweep)
+    >>> recording = SweepsInMemory("drive", [sweep])
     >>> resampler = SensorResampler(recording, Sensor.grid(360, 8, vertical_fov_deg=20))
     >>> len(sweep), len(resampler.sweep(0).sweep)
     (23040, 2880)
@@ -125,15 +125,15 @@ class SensorResampler:
             if max_range_m > recorded_sensor.max_range_m:
                 raise LidarError(
                     f"The maximum range of {self.sensor.model} is {max_range_m:g} m, but that of "
-                    f"{recorded_sensor.model} in {self.recording.name} is only "
+                    f"{recorded_sensor.model} in {self.recording.info.name} is only "
                     f"{recorded_sensor.max_range_m:g} m. Use a sensor file with a lower "
                     f"`max_range_m`. {_TWIN_HINT}"
                 )
         elif max_range_m > self._pulses.max_range_m:
             self.notes.append(
                 f"The maximum range of {self.sensor.model} is {max_range_m:g} m, but the returns "
-                f"in {self.recording.name} only reach {self._pulses.max_range_m:.0f} m. Surfaces "
-                "beyond the maximum range of the recorded sensor are missing."
+                f"in {self.recording.info.name} only reach {self._pulses.max_range_m:.0f} m. "
+                "Surfaces beyond the maximum range of the recorded sensor are missing."
             )
 
     def _fitting(self, rays: _Rays, *, partial: bool) -> Bools:
@@ -148,7 +148,7 @@ class SensorResampler:
             self._check_elevations(rays, np.flatnonzero(outside), np.flatnonzero(distant))
             if rays.is_beside.mean() > _MAX_MISSING:
                 raise LidarError(
-                    f"The horizontal field of view of {self.recording.name} is "
+                    f"The horizontal field of view of {self.recording.info.name} is "
                     f"{np.degrees(self._pulses.view_rad[1]):.0f}°, and does not contain that of "
                     f"{self.sensor.model}. {_PARTIAL_HINT} {_TWIN_HINT}"
                 )
@@ -158,14 +158,14 @@ class SensorResampler:
         if not fits.any():
             raise LidarError(
                 f"No pulse of {self.sensor.model} lies within the field of view and the resolution "
-                f"of {self.recording.name}. {_TWIN_HINT}"
+                f"of {self.recording.info.name}. {_TWIN_HINT}"
             )
         missing = 1 - fits.mean()
         if missing > _MAX_MISSING:
             remaining = len(np.unique(rays.channel[fits]))
             self.notes.append(
                 f"{100 * missing:.0f} % of the pulses of {self.sensor.model} are outside the field "
-                f"of view or between the rings of {self.recording.name} and are omitted. "
+                f"of view or between the rings of {self.recording.info.name} and are omitted. "
                 f"{remaining} of {plural(self.sensor.channels, 'channel')} remain."
             )
         return fits
@@ -177,7 +177,7 @@ class SensorResampler:
 
     def _check_elevations(self, rays: _Rays, outside: Ints, distant: Ints) -> None:
         """Raise LidarError if channels are outside the field of view or far from all rings."""
-        model, name = self.sensor.model, self.recording.name
+        model, name = self.sensor.model, self.recording.info.name
         top_deg, bottom_deg = np.degrees(self._pulses.elevation_rad[[0, -1]])
         if len(outside) and not _is_spinning(self.sensor):
             low_deg, high_deg = np.degrees([rays.elevation.min(), rays.elevation.max()])
@@ -216,8 +216,8 @@ class SensorResampler:
         if step_rad < _MIN_STEP_SHARE * recorded_rad:
             raise LidarError(
                 f"The azimuth resolution of {self.sensor.model} is "
-                f"{format_rounded(np.degrees(step_rad))}°, but that of {self.recording.name} is "
-                f"only {format_rounded(np.degrees(recorded_rad))}°. Use a sensor with fewer "
+                f"{format_rounded(np.degrees(step_rad))}°, but that of {self.recording.info.name} "
+                f"is only {format_rounded(np.degrees(recorded_rad))}°. Use a sensor with fewer "
                 f"firings per revolution. {_TWIN_HINT}"
             )
 
@@ -230,7 +230,7 @@ class SensorResampler:
         if shared > _MAX_SHARED:
             raise LidarError(
                 f"{100 * shared:.0f} % of the rays of {self.sensor.model} are closer to each other "
-                f"than the pulses in {self.recording.name}. {_TWIN_HINT}"
+                f"than the pulses in {self.recording.info.name}. {_TWIN_HINT}"
             )
 
     def _add_notes(self) -> None:

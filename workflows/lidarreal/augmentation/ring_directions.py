@@ -13,6 +13,7 @@ import numpy as np
 
 from lidarfiles.clouds.recording import Recording
 from lidarfiles.clouds.rings import elevations
+from lidarfiles.recordings.opening import with_sweeps
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, to_writable
@@ -74,7 +75,7 @@ class RingDirections:
         points = np.concatenate([points for _, points, _ in sweeps])
         rings = np.concatenate([rings for _, _, rings in sweeps])
         if not len(points):
-            raise LidarError(f"{recording.name} contains no returns.")
+            raise LidarError(f"{recording.info.name} contains no returns.")
         self.max_range_m = float(np.linalg.norm(points, axis=1).max())
         self.step_rad = _steps_rad([ringed[1:] for ringed in sweeps], len(self))
         azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -87,12 +88,9 @@ class RingDirections:
 
     def _check_rings(self) -> None:
         recording = self.recording
-        if recording.is_cloud or not len(recording):
-            raise LidarError(
-                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
-            )
+        with_sweeps(recording)
         if not len(recording.rings):
-            reason = recording.rings.note or f"The rings of {recording.name} are unknown."
+            reason = recording.rings.note or f"The rings of {recording.info.name} are unknown."
             raise LidarError(f"{reason} Without rings, its sweeps cannot be resampled.")
 
     def __len__(self) -> int:
@@ -116,9 +114,9 @@ class RingDirections:
     def _points_as_fired(self, sweep: Sweep) -> AnyArray:
         """Return the points without motion compensation, as far as the recording contains them."""
         recording = self.recording
-        if recording.fired is None or not sweep.compensated:
+        if not recording.info.has_firing_poses or not sweep.compensated:
             return sweep.points
-        fired = recording.read_fired(sweep.number)
+        fired = recording.fired(sweep.number)
         return fired.points if len(fired) == len(sweep) else sweep.points
 
     def _measured_profiles(self, rings: Ints, azimuth: Floats, elevation: Floats) -> Floats:

@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from lidarfiles.clouds.folder import result_folder
 from lidarfiles.clouds.format_table import format_of_path, formats_of_endings
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
+from lidarfiles.recordings.opening import close_recordings, open_ref, sensor_refs
 from lidarfiles.work.mapping import MapFunction, parallel_map
 from lidarfiles.work.work import ONCE, FileStep, Inputs, Work
 from lidarsim.errors import LidarError
@@ -37,9 +39,7 @@ from .sweep_tasks import (
     PlannedSweep,
     PlanProcess,
     PointCounts,
-    RecordingFile,
     SweepEncoder,
-    close_recordings,
     encoded_folder,
 )
 from .variants import TABLE_FILE, Variants, outputs_in_table, variants_table
@@ -138,7 +138,7 @@ class Augmentation:
         Whether to omit pulses of `resampled` that the recorded sensor does not observe.
     """
 
-    file: RecordingFile
+    file: RecordingRef
     variants: Variants
     model: Sensor | None = None
     numbers: range | None = None
@@ -197,9 +197,9 @@ class Augmentation:
             raise LidarError("`resume` and `restart` cannot be combined.")
         out = Path(out)
         try:
-            files = self.file.each_sensor()
+            files = sensor_refs(replace(self.file, keep_noise=True))
             if len(files) == 1:
-                check_sweeps(self.file.path, files[0].open())
+                check_sweeps(self.file.path, open_ref(files[0]))
             output = self._output()
             targets = self._targets(out, output)
             with ExitStack() as stack:
@@ -291,7 +291,7 @@ class _Run:
     """Run of an augmentation, which stores encoded sweeps until its copies are complete."""
 
     augmentation: Augmentation
-    files: tuple[RecordingFile, ...]  # the recording, once for each sensor
+    files: tuple[RecordingRef, ...]  # the recording, once for each sensor
     output: ExportSpec | None
     work: Work
     targets: tuple[Path, ...]
@@ -372,7 +372,7 @@ class _Run:
                 "Choose it with `--topic`."
             )
         has_insertions = any(effects.insertions for effects in plan.plan.variants.values())
-        if has_insertions and not all(part.recording.sequence for part in plan.all_parts()):
+        if has_insertions and not all(part.recording.info.sequence for part in plan.all_parts()):
             raise LidarError(
                 f"{path} contains {names}, so the sensor to which `--at` refers is ambiguous. "
                 "Choose it with `--topic`, or use `actors` in an effects file."

@@ -408,7 +408,7 @@ class ScanPattern:
         note = ""
         if pattern is None:
             note = (
-                f"The rings of {recording.name} are unknown, so pulses without a return are "
+                f"The rings of {recording.info.name} are unknown, so pulses without a return are "
                 "unknown, too. Rain, snow, fog and dust only return light in front of recorded "
                 "points."
             )
@@ -458,7 +458,7 @@ def _check_model(recording: Recording, model: Sensor | None) -> None:
     if model is None or not rings or rings <= model.channels:
         return
     raise LidarError(
-        f"{recording.name} has {rings} rings, but {model.model} has "
+        f"{recording.info.name} has {rings} rings, but {model.model} has "
         f"{plural(model.channels, 'channel')}. Pass the model of the sensor that was used."
     )
 
@@ -483,8 +483,8 @@ def _check_single_sensor(recording: Recording, sweeps: Sequence[Sweep]) -> None:
     if spreads and np.median(spreads) > _MAX_ELEVATION_CHANGE:
         raise LidarError(
             f"Rings with the same number have different elevations in different sweeps of "
-            f"{recording.name}, so the sweeps come from different sensors. Augment the sweeps of "
-            "each sensor separately."
+            f"{recording.info.name}, so the sweeps come from different sensors. Augment the sweeps "
+            "of each sensor separately."
         )
 
 

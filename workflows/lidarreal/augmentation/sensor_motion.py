@@ -72,7 +72,7 @@ class SensorMotion:
         are not read from the sweeps, which would take long.
         """
         poses = None
-        if has_objects or (recording.compensated and recording.read_poses is not None):
+        if has_objects or (recording.info.compensated and recording.has_stored_poses):
             poses = recording.poses(range(len(recording)))
         if poses is None or np.abs(poses[0, :3, 3]).max() <= _MAX_LOCAL_M:
             return cls(recording, poses)

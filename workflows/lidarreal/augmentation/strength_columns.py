@@ -71,7 +71,7 @@ class StrengthColumns:
         scale = IntensityScale.from_returns(recording, returns, model)
         intensity = returns.columns[scale.column]
         threshold = detection_threshold(scale, intensity, returns.range_m, model)
-        names = dict.fromkeys((*_NAMES, recording.intensity_column or scale.column))
+        names = dict.fromkeys((*_NAMES, recording.info.intensity_column or scale.column))
         energy = scale.energies(intensity, returns.range_m)
         others = [
             _fit_column(name, returns, energy, scale, model)

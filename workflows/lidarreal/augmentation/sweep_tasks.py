@@ -13,15 +13,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
-from pathlib import Path
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarfiles.clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
+from lidarfiles.clouds.recording import METERS, DerivedRecording, LastRead, Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import close_recordings, open_ref
 from lidarfiles.work.mapping import describe_sweeps
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
@@ -38,64 +38,6 @@ from .rewriting.opening import open_rewriter
 from .rewriting.rewriter import Rewriter, sweep_folder
 
 
-@lru_cache(maxsize=4)
-def _opened(path: Path, sensor: str | None, intensity: str | None) -> Recording:
-    """Open a recording. It is cached, because the sweeps of some bags must be counted."""
-    return open_recording(path, sensor, intensity, keep_noise=True)
-
-
-def close_recordings() -> None:
-    """Close the recordings that this process keeps open."""
-    _opened.cache_clear()
-
-
-@dataclass(frozen=True)
-class RecordingFile:
-    """File or folder of a recording, with the sensor and the column that the user chose.
-
-    Attributes
-    ----------
-    path
-        Path, which may be relative to `folder`.
-    sensor
-        Sensor or topic, if there are several.
-    intensity
-        Column that contains the intensities, if it is not ``intensity``.
-    folder
-        Working directory of the process that created this object.
-    """
-
-    path: Path
-    sensor: str | None = None
-    intensity: str | None = None
-    folder: Path = field(default_factory=Path.cwd)
-
-    @property
-    def located(self) -> Path:
-        """Path that is valid in this process. It is the given path if possible, for messages."""
-        return self.path if Path.cwd() == self.folder else self.folder / self.path
-
-    def open(self) -> Recording:
-        """Open the recording with all points of its file."""
-        return _opened(self.located, self.sensor, self.intensity)
-
-    def each_sensor(self) -> tuple[RecordingFile, ...]:
-        """Return this file once for each of its sensors, or only for the chosen sensor.
-
-        The sequences of a KITTI data set count as sensors.
-
-        Raises
-        ------
-        LidarError
-            If the recording cannot be read.
-        """
-        try:
-            self.open()
-        except SeveralSensorsError as error:
-            return tuple(replace(self, sensor=name) for name in error.names)
-        return (self,)
-
-
 @dataclass(frozen=True, eq=False)
 class AugmentationPlan:
     """Augmentation of a recording with one or several variants of effects.
@@ -103,7 +45,7 @@ class AugmentationPlan:
     Attributes
     ----------
     files
-        File of the recording, once for each of its sensors.
+        Reference to the recording, once for each of its sensors.
     variants
         Mapping of variant numbers to effects.
     model
@@ -120,7 +62,7 @@ class AugmentationPlan:
         Whether to omit pulses of `resampled` that the recorded sensor does not observe.
     """
 
-    files: Sequence[RecordingFile]
+    files: Sequence[RecordingRef]
     variants: Mapping[int, Effects]
     model: Sensor | None = None
     numbers: range | None = None
@@ -207,37 +149,33 @@ class PartProcess:
     """Recording of one sensor with its rewriter and augmenters, which are opened on first use."""
 
     plan: AugmentationPlan
-    file: RecordingFile
+    file: RecordingRef
     _augmenters: dict[int, Augmenter] = field(default_factory=dict)  # {variant: augmenter}
 
     @cached_property
-    def _read(self) -> _LastSweep:
-        path = self.file.located
-        if path.is_absolute() and not path.exists():
-            raise LidarError(
-                f"{path} does not exist on {socket.gethostname()}. Use a path that all workers "
-                "can access."
-            )
-        return _LastSweep(self.file.open())
-
-    @cached_property
-    def recording(self) -> Recording:
+    def recording(self) -> LastRead:
         """Recording whose last sweep stays in memory.
 
         Variants and rewriters therefore do not read it again. A bag would even be read from its
         start.
         """
-        return replace(self._read.recording, read=self._read)
+        path = self.file.located.path
+        if path.is_absolute() and not path.exists():
+            raise LidarError(
+                f"{path} does not exist on {socket.gethostname()}. Use a path that all workers "
+                "can access."
+            )
+        recording = open_ref(self.file)
+        assert isinstance(recording, Recording)  # the run has refused clouds
+        return LastRead(recording)
 
     @cached_property
     def rewriter(self) -> Rewriter:
         """Rewriter for the output format."""
-        path = self.file.located
-        spec = self.plan.output
-        if spec is None:
-            return open_rewriter(path, self.recording, self.file.sensor)
-        source = RecordingSource(path, str(path), self.file.sensor, self.file.intensity)
-        return FormatConverter(source, self.recording, spec)
+        ref = self.file.located
+        if self.plan.output is None:
+            return open_rewriter(ref, self.recording)
+        return FormatConverter(ref, self.recording, self.plan.output)
 
     @cached_property
     def resampler(self) -> Resampler | None:
@@ -258,14 +196,7 @@ class PartProcess:
         resampler = self.resampler
         if resampler is None:
             return self.recording
-        # The resampled sweeps have standard names and units.
-        return replace(
-            self.recording,
-            read=lambda number: resampler(number).sweep,
-            fired=None,
-            meters=METERS,
-            intensity_column=None,
-        )
+        return ResampledRecording(self.recording, resampler)
 
     def prepare(self, variant: int) -> None:
         """Raise LidarError if the recording cannot be augmented."""
@@ -322,26 +253,9 @@ class PartProcess:
     def release(self) -> None:
         """Release the augmenters and the last sweep."""
         self._augmenters.clear()
-        self._read.clear()
+        self.recording.release()
         self.__dict__.pop("resampler", None)
         self.__dict__.pop("source", None)
-
-
-class _LastSweep:
-    """Function that reads a sweep of a recording, and keeps the last one in memory."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        self._last: tuple[int, Sweep] | None = None
-
-    def __call__(self, number: int) -> Sweep:
-        if self._last is None or self._last[0] != number:
-            self._last = None  # frees its memory before the next sweep is read
-            self._last = number, self.recording.read(number)
-        return self._last[1]
-
-    def clear(self) -> None:
-        self._last = None
 
 
 class Resampler:
@@ -362,6 +276,29 @@ class Resampler:
     def notes(self) -> tuple[str, ...]:
         """Notes for the user."""
         return tuple(self._resampler.notes)
+
+
+class ResampledRecording(DerivedRecording):
+    """A recording whose sweeps are resampled, and have standard names and units.
+
+    Parameters
+    ----------
+    source
+        Recording to resample.
+    resampler
+        Function that returns a resampled sweep.
+    """
+
+    def __init__(self, source: Recording, resampler: Resampler) -> None:
+        super().__init__(
+            source,
+            replace(source.info, has_firing_poses=False, meters=METERS, intensity_column=None),
+        )
+        self._resampler = resampler
+
+    def load(self, number: int) -> Sweep:
+        """Return a resampled sweep."""
+        return self._resampler(number).sweep
 
 
 # Number of sensors that are checked before the first sweep is augmented, and whose notes are shown.

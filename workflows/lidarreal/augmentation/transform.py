@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from threading import Lock
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
 from lidarfiles.clouds.boxes import SweepBoxes
-from lidarfiles.clouds.recording import Recording
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.clouds.recording import PointCloud, Recording, SweepsInMemory
+from lidarfiles.recordings.opening import open_recording, with_sweeps
 from lidarsim.columns.column_names import standard_names
 from lidarsim.columns.sweep import Sweep
+from lidarsim.environment.extras import reading
 from lidarsim.errors import ArgumentError, LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Track
@@ -40,7 +40,7 @@ _NUMBERS = 1 << 31  # sweep numbers, which select the random numbers of a transf
 
 
 def augment(
-    recording: str | Path | Recording,
+    recording: str | Path | Recording | PointCloud,
     effects: EffectsLike | None = None,
     *,
     model: ModelLike | None = None,
@@ -88,19 +88,20 @@ def augment(
     >>> for sweep in augment("drive.mcap", rain_mm_h=25):  # doctest: +SKIP
     ...     print(len(sweep))
     """
-    if not isinstance(recording, str | Path | Recording):
+    if not isinstance(recording, str | Path | Recording | PointCloud):
         raise ArgumentError(
             f"The recording must be a path or a Recording, but its type is "
             f"{type(recording).__name__}. To augment sweeps and arrays, use the transform "
             "`Augment`."
         )
     chosen = _effects(effects, weather, seed)
-    if not isinstance(recording, Recording):
+    if isinstance(recording, str | Path):
         recording = open_recording(recording, keep_noise=True)
+    recorded = with_sweeps(recording)
     with _python_advice("Open the recording with `open_recording(path, intensity=COLUMN)`"):
-        augmenter = Augmenter(recording, chosen, _model(model), reflectance)
-    numbers = range(len(recording)) if sweeps is None else sweeps
-    return _augmented_sweeps(recording, augmenter, numbers)
+        augmenter = Augmenter(recorded, chosen, _model(model), reflectance)
+    numbers = range(len(recorded)) if sweeps is None else sweeps
+    return _augmented_sweeps(recorded, augmenter, numbers)
 
 
 def _augmented_sweeps(
@@ -268,41 +269,22 @@ class Augment:
         return self._states[names].augment(sweep, seed)
 
     def _sensor_state(self, sweeps: Sequence[Sweep]) -> _SensorState:
-        source = _SweepSource(sweeps)
-        recording = Recording("the sweep", len(sweeps), source)
+        recording = SweepsInMemory("the sweep", sweeps)
         with _python_advice("Pass the names of the columns as `columns`, including an intensity"):
             augmenter = Augmenter(recording, self.effects, self.model, self.reflectance)
-        return _SensorState(source, recording, augmenter)
+        return _SensorState(recording, augmenter)
 
 
-class _SweepSource:
-    """Function that reads sweeps in memory, or another sweep of the same sensor."""
-
-    def __init__(self, sweeps: Sequence[Sweep]) -> None:
-        self._sweeps = sweeps
-        self.current: Sweep | None = None
-
-    def __call__(self, number: int) -> Sweep:
-        return self._sweeps[number] if self.current is None else self.current
-
-
-@dataclass(frozen=True, eq=False)
-class _SensorState:
+class _SensorState(NamedTuple):
     """What the sweeps of a sensor have in common."""
 
-    source: _SweepSource
     recording: Recording
     augmenter: Augmenter
-    lock: Lock = field(default_factory=Lock)
 
     def augment(self, sweep: Sweep, seed: int) -> AugmentedSweep:
-        with self.lock:
-            self.source.current = sweep
-            try:
-                read = self.recording[0]
-            finally:
-                self.source.current = None
-        return self.augmenter.augment(read, seed % _NUMBERS)
+        with reading(self.recording.info.name):
+            standard = self.recording.standardize(0, sweep)
+        return self.augmenter.augment(standard, seed % _NUMBERS)
 
 
 @contextmanager
@@ -372,7 +354,7 @@ def _moves(actor: Actor) -> bool:
 
 
 def _reference_sweeps(
-    reference: str | Path | Recording | Sequence[Sweep],
+    reference: str | Path | Recording | PointCloud | Sequence[Sweep],
 ) -> list[Sweep]:
     """Return a few sweeps of a reference without their poses."""
     if isinstance(reference, str | Path):
@@ -397,7 +379,9 @@ def _with_boxes(recorded: Sweep, augmented: AugmentedSweep) -> Sweep:
     boxes = augmented.boxes
     if not len(boxes):
         return augmented.sweep.replace(boxes=recorded._boxes)
-    return augmented.sweep.replace(boxes=_join_boxes(recorded.boxes, boxes))
+    recorded_boxes = recorded.boxes
+    assert recorded_boxes is None or isinstance(recorded_boxes, SweepBoxes)
+    return augmented.sweep.replace(boxes=_join_boxes(recorded_boxes, boxes))
 
 
 def _join_boxes(first: SweepBoxes | None, second: SweepBoxes) -> SweepBoxes:

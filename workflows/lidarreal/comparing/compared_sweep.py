@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats, Ints
@@ -38,15 +38,14 @@ def compared_in_world(sweeps: PosedSweeps, number: int) -> Sweep:
     Raises LidarError if the recording cannot be read, or if the pose of the sweep is unknown.
     """
     recording = sweeps.recording
-    sweep = recording[number].returns() if recording.is_cloud else sweeps.read(number)
-    sweep = with_compared_columns(sweep)
+    sweep = with_compared_columns(sweeps.read(number))
     sweep = sweep.with_columns(intensity=sweep.intensity)
     check_reach(recording, sweep)
-    if recording.is_cloud:
+    if isinstance(recording, PointCloud):
         return sweep
     if sweep.pose is None:
         raise LidarError(
-            f"{recording.name} is in sensor coordinates and does not contain the pose of the "
+            f"{recording.info.name} is in sensor coordinates and does not contain the pose of the "
             "sensor. Compare it with a recording that consists of sweeps."
         )
     return sweep.replace(points=sweep.in_world())
@@ -65,7 +64,9 @@ def separation_m(a: Floats, b: Floats) -> float:
     return float(np.maximum(a[0] - b[1], b[0] - a[1]).max())
 
 
-def origin_to_add(origins: Sequence[Floats | None], bounds: Sequence[Floats]) -> OriginShift | None:
+def origin_to_add(
+    origins: Sequence[tuple[float, float, float] | None], bounds: Sequence[Floats]
+) -> OriginShift | None:
     """Return the world origin to add to one of two clouds, or None if they are in the same frame.
 
     Results with a world origin are in world coordinates, but their scene and results without this
@@ -75,7 +76,7 @@ def origin_to_add(origins: Sequence[Floats | None], bounds: Sequence[Floats]) ->
     Parameters
     ----------
     origins
-        World origins of both clouds, or None.
+        World origins of both clouds in meters, or None.
     bounds
         Bounding boxes of both clouds, of shape (2, 3), in meters.
     """
@@ -85,7 +86,7 @@ def origin_to_add(origins: Sequence[Floats | None], bounds: Sequence[Floats]) ->
         if origin is None or origins[local] is not None or apart_m <= 0:
             continue
         if separation_m(bounds[placed], bounds[local] + origin) < apart_m:
-            return OriginShift(local, placed, origin)
+            return OriginShift(local, placed, np.array(origin))
     return None
 
 
@@ -105,11 +106,11 @@ class OriginShift(NamedTuple):
         )
 
 
-def check_reach(recording: Recording, sweep: Sweep) -> None:
+def check_reach(recording: Recording | PointCloud, sweep: Sweep) -> None:
     """Raise LidarError if a coordinate is implausibly large."""
     if (reach := float(np.abs(sweep.points).max(initial=0.0))) > MAX_COORDINATE_M:
         raise LidarError(
-            f"{recording.name} extends {reach:.3g} m from the origin, which is farther than "
+            f"{recording.info.name} extends {reach:.3g} m from the origin, which is farther than "
             "anything on Earth. The file is probably damaged, or its length unit is wrong."
         )
 
@@ -129,13 +130,15 @@ def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
     return sweep.replace(columns=columns)
 
 
-def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
+def rings_note(recording: Recording | PointCloud, sweep: Sweep) -> list[str]:
     """Return a note about how the rings of a sweep were determined.
 
     The list is empty if the rings are stored in a column or are unknown.
     """
     is_stated = "channel" in sweep.columns or sweep.rings is None
-    return [] if is_stated else [recording.rings.note.removesuffix(".")]
+    if is_stated or isinstance(recording, PointCloud):
+        return []
+    return [recording.rings.note.removesuffix(".")]
 
 
 def _ray_keys(columns: Columns) -> Ints:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarsim.errors import LidarError
 from lidarsim.scene.files.coordinate_systems import describe_heights, same_vertical_datum
 from lidarsim.scene.files.stated_system import StatedSystem
@@ -22,11 +22,11 @@ class StatedFrame:
     system: StatedSystem | None = None
 
     @classmethod
-    def from_recording(cls, recording: Recording, name: str) -> StatedFrame:
+    def from_recording(cls, recording: Recording | PointCloud, name: str) -> StatedFrame:
         """Return the frame that a recording states."""
-        system = recording.system
+        system = recording.info.system
         if system is None:
-            return cls.from_epsg(recording.epsg, name)
+            return cls.from_epsg(recording.info.epsg, name)
         system_name = f"EPSG:{system.epsg}" if system.epsg is not None else system.name
         return cls(name, system.epsg, system_name, system.vertical_datum, system)
 

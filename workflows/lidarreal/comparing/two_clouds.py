@@ -13,7 +13,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording, SeveralSensorsError
+from lidarfiles.clouds.recording import PointCloud, Recording
+from lidarfiles.clouds.recording_ref import SeveralSensorsError
 from lidarfiles.datasets.figures import rank_correlation
 from lidarfiles.open3d_access.neighbors import nearest_neighbors
 from lidarfiles.parts.parts import StoredCloud
@@ -129,19 +130,19 @@ def compare(
         )
     recordings = first, second
     comparing = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg, protocol)
-    if not first.is_cloud and not second.is_cloud:
+    if isinstance(first, Recording) and isinstance(second, Recording):
         pairs = _pair_sweeps(first, second, match)
         if sweeps:
             pairs = _choose_pairs(pairs, sweeps)
-        elif len(pairs) < max(first.count, second.count):
+        elif len(pairs) < max(len(first), len(second)):
             comparing.add_note(
-                f"A has {plural(first.count, 'sweep')} and B has {second.count:,}. Matching "
+                f"A has {plural(len(first), 'sweep')} and B has {len(second):,}. Matching "
                 f"by {match} results in {plural(len(pairs), 'pair')}"
             )
         comparing.pairs = pairs
-        if {first.compensated, second.compensated} == {True, False}:
+        if {first.info.compensated, second.info.compensated} == {True, False}:
             comparing.add_note(
-                _motion_note(*sorted((first, second), key=lambda r: not r.compensated))
+                _motion_note(*sorted((first, second), key=lambda r: not r.info.compensated))
             )
         budget = MAX_VALUES // len(pairs)
         for done, (number_a, number_b) in enumerate(pairs, 1):
@@ -152,16 +153,18 @@ def compare(
             )
             comparing.add_sweeps((number_a, number_b), sweep_a, sweep_b, budget)
         return comparing.result()
-    cloud = first if first.is_cloud else second
+    cloud = first if isinstance(first, PointCloud) else second
     if sweeps or match == "time":
-        raise LidarError(f"{cloud.name} has no sweeps. Omit `--sweep` and `--match`.")
+        raise LidarError(f"{cloud.info.name} has no sweeps. Omit `--sweep` and `--match`.")
     if azimuth_deg is not None:
-        raise LidarError(f"{cloud.name} has no sweeps, which `--azimuth-deg` requires.")
+        raise LidarError(f"{cloud.info.name} has no sweeps, which `--azimuth-deg` requires.")
     if protocol is not None:
-        raise LidarError(f"{cloud.name} has no sweeps, which `--protocol {protocol}` requires.")
+        raise LidarError(
+            f"{cloud.info.name} has no sweeps, which `--protocol {protocol}` requires."
+        )
     comparing.notes.append(
-        f"{cloud.name} has no sweeps, so all points are compared at once in world coordinates, "
-        "and only by distance and intensity"
+        f"{cloud.info.name} has no sweeps, so all points are compared at once in world "
+        "coordinates, and only by distance and intensity"
     )
     points_a = comparing.read_cloud(first, max_points)
     points_b = comparing.read_cloud(second, max_points)
@@ -198,9 +201,10 @@ def _sensor_chosen_by(option: str) -> Iterator[None]:
 def _motion_note(compensated: Recording, fired: Recording) -> str:
     """Return a note which states that only the first recording is compensated for motion."""
     return (
-        f"{compensated.name} is compensated for the motion of the sensor during each sweep, but "
-        f"{fired.name} contains points as fired, so the differences include this motion. Export "
-        "the result as fired with `lidarpool export RESULT --format mcap` and compare the file, or "
+        f"{compensated.info.name} is compensated for the motion of the sensor during each sweep, "
+        f"but {fired.info.name} contains points as fired, so the differences include this motion. "
+        "Export the result as fired with `lidarpool export RESULT --format mcap` and compare the "
+        "file, or "
         "export both with `--compensated`"
     )
 
@@ -220,7 +224,7 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
 
 
 def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]]:
-    pairs = [(number, number) for number in range(min(a.count, b.count))]
+    pairs = [(number, number) for number in range(min(len(a), len(b)))]
     if match == "time":
         times_a = _sweep_times(a)
         times_b = _sweep_times(b)
@@ -234,15 +238,15 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
             pairs = [(int(nearest_a[number]), int(number)) for number in close]
     if not pairs:
         raise LidarError(
-            f"{a.name} has {plural(a.count, 'sweep')} and {b.name} has {b.count:,}, but none of "
-            f"them match by {match}."
+            f"{a.info.name} has {plural(len(a), 'sweep')} and {b.info.name} has {len(b):,}, but "
+            f"none of them match by {match}."
         )
     return pairs
 
 
 def _sweep_times(recording: Recording) -> Floats:
     if recording.stamps_ns is None:
-        raise LidarError(f"{recording.name} has no sweep times. Omit `--match time`.")
+        raise LidarError(f"{recording.info.name} has no sweep times. Omit `--match time`.")
     return recording.stamps_ns
 
 
@@ -273,7 +277,7 @@ class _NearestPairs(NamedTuple):
 class _Comparing:
     """Comparison in progress, to which pairs of sweeps are added one by one."""
 
-    recordings: tuple[Recording, Recording]
+    recordings: tuple[Recording | PointCloud, Recording | PointCloud]
     distances_m: tuple[float, ...]
     azimuth_deg: float | None
     protocol: str | None
@@ -303,25 +307,25 @@ class _Comparing:
     def _collector(self, protocol: str) -> FrameCollector:
         """Return the collector of a protocol, or raise LidarError if returns were discarded."""
         for recording in self.recordings:
-            if recording.thinned:
+            if recording.info.thinned:
                 raise LidarError(
-                    f"{recording.name} contains only some of the returns, so the metrics of "
+                    f"{recording.info.name} contains only some of the returns, so the metrics of "
                     f"`--protocol {protocol}` are undefined. Use a result with `keep_every: 1`."
                 )
         first, second = self.recordings
-        return FrameCollector((first.energies, second.energies))
+        return FrameCollector((first.info.energies, second.info.energies))
 
     def add_note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
 
-    def read_cloud(self, recording: Recording, max_points: int) -> Sweep:
+    def read_cloud(self, recording: Recording | PointCloud, max_points: int) -> Sweep:
         """Read a cloud in world coordinates, evenly subsampled to about `max_points` points."""
-        count = recording.point_count
+        count = recording.info.point_count
         fraction = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
         sweeps = PosedSweeps(recording)
-        for number in range(recording.count):
+        for number in range(len(recording)):
             part = compared_in_world(sweeps, number)
             if fraction < 1:
                 part = part.select(even_indices(len(part), round(fraction * len(part))))
@@ -330,8 +334,8 @@ class _Comparing:
         if fraction == 1 or not parts:
             return Sweep.concatenate(parts)
         self.add_note(
-            f"{100 * fraction:.3g} % of the {count:,} points in {recording.name} are compared, "
-            "sampled evenly. Distances to this cloud are therefore overestimated"
+            f"{100 * fraction:.3g} % of the {count:,} points in {recording.info.name} are "
+            "compared, sampled evenly. Distances to this cloud are therefore overestimated"
         )
         return Sweep.concatenate(parts)
 
@@ -339,12 +343,12 @@ class _Comparing:
         """Add the world origin of one recording to the points of the other, if these are local."""
         shifted = [*clouds]
         if all(map(len, clouds)):
-            origins = [recording.world_origin for recording in self.recordings]
+            origins = [recording.info.world_origin for recording in self.recordings]
             bounds = [bounds_of(cloud.points) for cloud in clouds]
             if (shift := origin_to_add(origins, bounds)) is not None:
                 local = clouds[shift.local]
                 shifted[shift.local] = local.replace(points=local.points + shift.origin)
-                self.add_note(shift.note([recording.name for recording in self.recordings]))
+                self.add_note(shift.note([recording.info.name for recording in self.recordings]))
         return shifted
 
     def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
@@ -398,7 +402,7 @@ class _Comparing:
         reason why there are none is recorded for a note.
         """
         first, second = self.recordings
-        names = first.name, second.name
+        names = first.info.name, second.info.name
         rays = pair_rays(a, b) if self.has_same_rays else None
         images = None
         try:
@@ -467,7 +471,8 @@ class _Comparing:
             if not count:
                 listed = "".join(f" {note}." for note in recording.omission_notes)
                 raise LidarError(
-                    f"{recording.name} contains no points, so there is nothing to compare.{listed}"
+                    f"{recording.info.name} contains no points, so there is nothing to compare."
+                    f"{listed}"
                 )
         if not self.points:
             raise LidarError("None of the pairs has points in both sweeps. Choose other sweeps.")
@@ -508,8 +513,8 @@ class _Comparing:
         counts = self.point_counts.tolist()
         return {
             key: {
-                "name": recording.name,
-                "sweeps": None if recording.is_cloud else recording.count,
+                "name": recording.info.name,
+                "sweeps": None if isinstance(recording, PointCloud) else len(recording),
                 "compared_sweeps": self._compared_sweeps(number),
                 "points": count,
             }
@@ -521,7 +526,7 @@ class _Comparing:
     def _compared_sweeps(self, number: int) -> list[int] | None:
         """Return the compared sweeps of A (0) or B (1), or None if all of them are compared."""
         indices = sorted({pair[number] for pair in self.pairs})
-        return None if len(indices) == self.recordings[number].count else indices
+        return None if len(indices) == len(self.recordings[number]) else indices
 
     def _intensity_figures(self, a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
         """Return statistics of paired intensities, or None if they have no rank correlation."""
@@ -533,8 +538,8 @@ class _Comparing:
             "rank_correlation": correlation,
             "pairs": len(a),
             "of": paired_by,
-            "columns": {"a": first.intensity_name, "b": second.intensity_name},
-            "same_scale": first.energies and second.energies,
+            "columns": {"a": first.info.intensity_name, "b": second.info.intensity_name},
+            "same_scale": first.info.energies and second.info.energies,
         }
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
@@ -573,7 +578,8 @@ class _Comparing:
         first, second = self.recordings
         if not self.has_same_rays:
             instead = "Their ranges are not compared"
-            if first.energies and second.energies and None in (first.ray_times, second.ray_times):
+            is_known = None not in (first.ray_times, second.ray_times)
+            if first.info.energies and second.info.energies and not is_known:
                 instead += (
                     ". To compare two results ray by ray, run both with `cloud: {columns: [time]}`"
                 )
@@ -596,7 +602,9 @@ class _Comparing:
                 rings = "ring" if len(dead) == 1 else "rings"
                 others = len(dead) - _LISTED_RINGS
                 listed = dead[:_LISTED_RINGS] + ([f"{others} others"] if others > 0 else [])
-                notes.append(f"{recording.name} has no returns in {rings} {join_names(listed)}")
+                notes.append(
+                    f"{recording.info.name} has no returns in {rings} {join_names(listed)}"
+                )
         return notes
 
     def _images(self) -> RangeImages | None:
@@ -605,7 +613,7 @@ class _Comparing:
     def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
         """Return statistics of all ranges, and of each ring by descending elevation."""
         images = self._images()
-        has_gaps = not any(recording.thinned for recording in self.recordings)
+        has_gaps = not any(recording.info.thinned for recording in self.recordings)
         rings = sorted(self.rings.items(), key=lambda item: -item[1][0]) if images else []
         all_counts = sum((count for _, count in self.rings.values()), self.ray_counts)
         no_return = _no_return_figures(all_counts) if has_gaps else None

@@ -289,7 +289,7 @@ class AlignedSweeps:
     @property
     def name(self) -> str:
         """Name of the recording, for use in messages."""
-        return self.recorded.recording.name
+        return self.recorded.recording.info.name
 
     def find_coverage(self, numbers: Ints) -> SensorCoverage:
         """Return the coverage with the blocked directions that some sweeps show.
@@ -450,7 +450,9 @@ def align(
     """
     samples = [_sample(sweeps.read_surfaces(number), number) for number in numbers.tolist()]
     rows = [row for row, number in enumerate(numbers.tolist()) if number in mapped]
-    return _align_iteratively(sweeps.recording.name, samples, first.select(numbers), rows, _ROUNDS)
+    return _align_iteratively(
+        sweeps.recording.info.name, samples, first.select(numbers), rows, _ROUNDS
+    )
 
 
 def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Motion:
@@ -467,7 +469,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     numbers = range(sweeps.count)[window]
     samples = [_sample(sweeps.read_surfaces(number), number) for number in numbers]
     candidates = _motion_candidates(sweeps, samples)
-    name = sweeps.recording.name
+    name = sweeps.recording.info.name
     local = poses.select(window)
     trial = partial(_filled_voxels, sweeps, samples, local, voxel_m)
     # Sorting and nearest-neighbor queries release the GIL.
@@ -523,7 +525,7 @@ def _filled_voxels(
     alignment = Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count, lasers)
     numbers = range(len(scaled))
     rounds = 0 if poses.are_given else _TRIAL_ROUNDS
-    alignment = _align_iteratively(sweeps.recording.name, scaled, alignment, numbers, rounds)
+    alignment = _align_iteratively(sweeps.recording.info.name, scaled, alignment, numbers, rounds)
     parts = []
     for number, sample in enumerate(scaled):
         points, _ = alignment.compensate(sample, number)

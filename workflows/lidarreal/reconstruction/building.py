@@ -14,9 +14,9 @@ import numpy as np
 
 from lidarfiles.clouds.folder import check_new_result, result_folder
 from lidarfiles.clouds.kitti import CALIBRATION_FILE
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarfiles.parts.parts import StoredCloud
-from lidarfiles.recordings.opening import as_recording
+from lidarfiles.recordings.opening import as_recording, with_sweeps
 from lidarfiles.work.mapping import MapFunction, parallel_map
 from lidarfiles.work.work import Inputs, Step, Work
 from lidarsim._version import __version__
@@ -95,7 +95,7 @@ _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
 
 
 def twin(
-    recording: str | Path | Cloud | StoredCloud | Recording,
+    recording: str | Path | Cloud | StoredCloud | Recording | PointCloud,
     *,
     model: str | Path | None = None,
     trajectory: str | Path | None = None,
@@ -190,11 +190,12 @@ def twin(
                 "A recording in memory can only be reconstructed in this process. Pass the "
                 "path of a recording to use a cluster, or omit the client."
             )
-        recorded = RecordedSweeps.from_recording(as_recording(recording, sensor, intensity))
+        opened = with_sweeps(as_recording(recording, sensor, intensity))
+        recorded = RecordedSweeps.from_recording(opened)
     _check_sweeps(recorded)
     source = _actor_source(recorded, actors)
     if base is None and not len(recorded.elevation_rad):
-        reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
+        reason = " ".join(recorded.notes) or f"{recorded.recording.info.name} has no rings."
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
@@ -229,11 +230,11 @@ def _check_output(out: str | Path | None, *, resume: bool, restart: bool, overwr
 def _check_sweeps(recorded: RecordedSweeps) -> None:
     """Raise LidarError if the recording is unsuitable for a reconstruction."""
     recording = recorded.recording
-    if recording.thinned:
+    if recording.info.thinned:
         raise LidarError(f"{recording.notes[0]}.")
     if recorded.count < MIN_SWEEPS:
         raise LidarError(
-            f"{recording.name} has {plural(recorded.count, 'sweep')}, but a reconstruction "
+            f"{recording.info.name} has {plural(recorded.count, 'sweep')}, but a reconstruction "
             f"requires at least {MIN_SWEEPS}, because sweeps that agree identify stationary "
             "surfaces."
         )
@@ -250,9 +251,8 @@ def _actor_source(recorded: RecordedSweeps, chosen: ActorSource | None) -> Actor
         return "boxes"
     if chosen == "boxes":
         raise LidarError(
-            f"{recorded.recording.name} contains no labeled boxes of objects that are identified "
-            "in several sweeps. Set `actors` to `clusters`, or "
-            "omit it."
+            f"{recorded.recording.info.name} contains no labeled boxes of objects that are "
+            "identified in several sweeps. Set `actors` to `clusters`, or omit it."
         )
     return "clusters"
 
@@ -264,16 +264,17 @@ def _inputs(
 
     A recording in memory has no identity, so it never matches an earlier one.
     """
-    source = recorded.source
-    if isinstance(source, Recording):
+    ref = recorded.ref
+    if ref is None:
         return Inputs({}, {"recording": secrets.token_hex(), **values})
-    files = {"recording": source[0]}
+    files = {"recording": ref.path}
     if trajectory is not None:
         files |= {
             "trajectory": trajectory,
             "calibration": trajectory.with_name(CALIBRATION_FILE),
         }
-    return Inputs(files, {"part of the recording": source, **values})
+    part = str(ref.folder / ref.path), ref.sensor, ref.intensity, recorded.window
+    return Inputs(files, {"part of the recording": part, **values})
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,7 +313,7 @@ class _Building:
             drawn_share=0.0,
             beam_rad=_beam_rad(self.base),
         )
-        is_shared = not isinstance(recorded.source, Recording)
+        is_shared = recorded.ref is not None
         count = len(submaps) if is_shared else 1
         with parallel_map(self.client, count, _SUBMAP_BYTES) as run:
             task = replace(task, alignment=self._align_submaps(run, task, submaps))
@@ -408,9 +409,9 @@ class _Building:
         response = fit_response(
             [self._load_observations(index) for index in some],
             recorded.ring_count,
-            are_energies=recorded.recording.energies,
+            are_energies=recorded.recording.info.energies,
         )
-        name = Path(recorded.recording.name).name
+        name = Path(recorded.recording.info.name).name
         # All points of a submap may belong to its neighbors.
         meshes = {
             index: part.surfels.mesh(name)
@@ -556,7 +557,7 @@ class _Building:
         vehicle = self.recorded.vehicle
         return {
             "versions": {"lidarpool": __version__},
-            "name": Path(self.recorded.recording.name).name,
+            "name": Path(self.recorded.recording.info.name).name,
             "sweeps": self.recorded.count,
             "used_sweeps": sum(len(one.points) for one in surfels),
             "submaps": len(surfels),
@@ -567,7 +568,7 @@ class _Building:
             "surfels": sum(len(one.corners) for one in surfels),
             "dark_surfels": sum(len(one.dark_corners) for one in surfels),
             "voxel_m": self.voxel_m,
-            "lidar4d_window": _window_of(self.recorded),
+            "lidar4d_window": self.recorded.window,
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
             "thickness_m": list(alignment.thickness_m),
             "plane_distance_m": _median(alignment.plane_distance_m),
@@ -586,17 +587,12 @@ def _beam_rad(model: SensorModel | None) -> float:
     return 1e-3 * float(np.mean(model.optics.divergence_mrad))
 
 
-def _window_of(recorded: RecordedSweeps) -> int | None:
-    """Return the first frame of the window of LiDAR4D that is used, or None."""
-    return None if isinstance(recorded.source, Recording) else recorded.source.window
-
-
 def _held_out_split(recorded: RecordedSweeps, counting: Ints) -> tuple[Ints, Ints]:
     """Return the numbers of the sweeps from which the map is built, and of those to compare.
 
     `counting` are the numbers of the sweeps that are used, in ascending order.
     """
-    window = _window_of(recorded)
+    window = recorded.window
     if window is None:
         others = counting[1::2]
         return counting[::2], others[even_indices(len(others), _COMPARED_SWEEPS)]

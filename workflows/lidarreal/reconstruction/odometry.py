@@ -97,7 +97,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     # In recordings with one file per sweep, many files state the same default pose, such as
     # VIEWPOINT in PCD files.
     # a lidarpool result, whose sensor may be stationary
-    is_known = sweeps.recording.fired is not None
+    is_known = sweeps.recording.info.has_firing_poses
     if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
         poses = recorded
         source = "from the recording"
@@ -112,7 +112,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
             number = int(steps_m.argmax()) + 1
             raise LidarError(
                 f"Registration failed, because it places sweep {number} of "
-                f"{sweeps.recording.name} {steps_m.max():.1f} m away from sweep {number - 1}. "
+                f"{sweeps.recording.info.name} {steps_m.max():.1f} m away from sweep {number - 1}. "
                 "Pass the poses with `--trajectory`."
             )
     located = RecordedPoses.in_world(poses, times_s, source)
@@ -130,7 +130,7 @@ def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tu
     if rows is not None:
         return _sensor_poses(sweeps, trajectory, rows), times_s
     track = load_trajectory(trajectory)
-    name = sweeps.recording.name
+    name = sweeps.recording.info.name
     first_s, last_s = (float(track.times_s[k]) for k in (0, -1))
     if sweeps.stamps_s is None:
         if len(track.times_s) != sweeps.count:
@@ -162,14 +162,14 @@ def _sensor_poses(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Flo
     The rows are camera poses if the recording, or otherwise the folder of the file, contains a
     KITTI calibration.
     """
-    name = sweeps.recording.name
+    name = sweeps.recording.info.name
     if len(rows) != sweeps.count:
         raise LidarError(
             f"{trajectory} contains {plural(len(rows), 'row')} without times, but {name} has "
             f"{plural(sweeps.count, 'sweep')}. Provide one row for each sweep, or poses with "
             "times, such as a TUM file."
         )
-    of_recording = sweeps.recording.calibration
+    of_recording = sweeps.recording.info.calibration
     is_calibrated = of_recording is not None and of_recording.exists()
     calibration = of_recording if is_calibrated else trajectory.with_name(CALIBRATION_FILE)
     assert calibration is not None

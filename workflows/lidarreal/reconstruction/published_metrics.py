@@ -45,7 +45,7 @@ class HeldOutFrames(NamedTuple):
         known = [values for values in intensities if values is not None]
         full_scale = np.nan
         if known:
-            energies = sweeps.recorded.recording.energies
+            energies = sweeps.recorded.recording.info.energies
             full_scale = full_scale_of(np.concatenate(known), are_energies=energies)
         frames = []
         for number in numbers:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording, RecordingInfo
 from lidarsim._version import __version__
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -282,43 +282,72 @@ def _fit_to_sweeps(
     Points as fired have a firing pose for each pulse. Motion-compensated points have none, so their
     rings are blurred, and parallax at close objects looks like lost pulses.
     """
-    recorded = sweeps.recorded
-    poses = sweeps.alignment.poses[chosen]
     are_energies = response is not None and response.model is IntensityModel.ENERGIES
     white = None if response is None else response.white
+    recording = _AlignedRecording(sweeps, chosen, white if are_energies else None, are_energies)
+    pose = recording.load_poses() if recording.is_compensated else None
+    return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)
 
-    def with_points(sweep: Sweep, points: Floats, **fields: Any) -> Sweep:
-        intensity = sweep.intensity
-        if intensity is not None:  # convert to energy, where white at 10 m is 1
-            intensity = intensity / (white if are_energies and white else 1)
-        channel = recorded.ring_count - 1 - sweep.columns["row"]
-        return sweep.with_columns(channel=channel, intensity=intensity).replace(
-            points=points, **fields
+
+class _AlignedRecording(Recording):
+    """Aligned sweeps, as fired or compensated for motion.
+
+    Parameters
+    ----------
+    sweeps
+        The sweeps.
+    chosen
+        Numbers of the sweeps of the recording, of shape (n,).
+    white
+        Intensity that is converted to the energy 1, or None to keep intensities.
+    are_energies
+        Whether intensities are energies after this conversion.
+    """
+
+    def __init__(
+        self, sweeps: AlignedSweeps, chosen: Ints, white: float | None, are_energies: bool
+    ) -> None:
+        recorded = sweeps.recorded
+        # The pulses of lasers at different positions have firing poses of their own.
+        self.is_compensated = (
+            sweeps.alignment.motion is Motion.COMPENSATED and recorded.lasers.is_at_origin
         )
+        super().__init__(
+            RecordingInfo(
+                sweeps.name,
+                energy_unit=1.0 if are_energies else None,
+                has_firing_poses=not self.is_compensated,
+                noise_classes=None,
+            )
+        )
+        self._aligned = sweeps
+        self._chosen = chosen
+        self._white = white
 
-    def fired(index: int) -> Sweep:
-        number = int(chosen[index])
-        sweep = recorded.read(number)
-        as_fired = sweeps.alignment.points_as_fired(sweep, number)
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def load(self, number: int) -> Sweep:
+        if not self.is_compensated:
+            return self.load_fired(number)
+        stored_number = int(self._chosen[number])
+        sweep = self._aligned.recorded.read(stored_number)
+        return self._with_points(sweep, self._aligned.align(sweep, stored_number).points)
+
+    def load_fired(self, number: int) -> Sweep:
+        stored_number = int(self._chosen[number])
+        sweep = self._aligned.recorded.read(stored_number)
+        as_fired = self._aligned.alignment.points_as_fired(sweep, stored_number)
         assert as_fired is not None
         points, firing_poses = as_fired
-        return with_points(sweep, points, firing_poses=firing_poses)
+        return self._with_points(sweep, points).replace(firing_poses=firing_poses)
 
-    def compensated(index: int) -> Sweep:
-        number = int(chosen[index])
-        sweep = recorded.read(number)
-        return with_points(sweep, sweeps.align(sweep, number).points)
+    def load_poses(self) -> Floats:
+        return self._aligned.alignment.poses[self._chosen]
 
-    # The pulses of lasers at different positions have firing poses of their own.
-    is_compensated = sweeps.alignment.motion is Motion.COMPENSATED and recorded.lasers.is_at_origin
-    recording = Recording(
-        sweeps.name,
-        len(chosen),
-        compensated if is_compensated else fired,
-        energy_unit=1.0 if are_energies else None,
-        read_poses=lambda: poses,
-        fired=None if is_compensated else fired,
-        noise_classes=None,
-    )
-    pose = poses if is_compensated else None
-    return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)
+    def _with_points(self, sweep: Sweep, points: Floats) -> Sweep:
+        intensity = sweep.intensity
+        if intensity is not None:  # convert to energy, where white at 10 m is 1
+            intensity = intensity / (self._white or 1)
+        channel = self._aligned.recorded.ring_count - 1 - sweep.columns["row"]
+        return sweep.with_columns(channel=channel, intensity=intensity).replace(points=points)

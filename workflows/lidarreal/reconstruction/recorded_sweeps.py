@@ -7,16 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarfiles.clouds.point_times import PointTimes
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import Recording, RecordingSection
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
-from lidarfiles.recordings.opening import open_recording
+from lidarfiles.recordings.opening import open_recording, with_sweeps
 from lidarsim.columns.column_names import STRENGTHS, TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
@@ -38,37 +38,21 @@ _MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rin
 _MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
 
 
-class RecordingSelection(NamedTuple):
-    """File or folder of a recording, and the part of it to read."""
-
-    path: Path
-    sensor: str | None = None  # sensor or topic
-    intensity: str | None = None  # intensity column
-    window: int | None = None  # first frame of a window of LiDAR4D
-
-
-@lru_cache(maxsize=1)
-def _opened(file: RecordingSelection) -> Recording:
-    path, sensor, intensity, window = file
-    recording = open_recording(path, sensor, intensity, name="the recording")
-    return recording if window is None else _select_window(recording, WINDOWS[window])
-
-
 def _select_window(recording: Recording, window: Window) -> Recording:
     """Return the sweeps of a window.
 
     Raise LidarError if the recording has neither all frames up to the last one of the window, nor
     only those of the window.
     """
-    if recording.count == window.count:
+    if len(recording) == window.count:
         return recording
-    if recording.is_cloud or recording.count <= window.last:
+    if len(recording) <= window.last:
         raise LidarError(
-            f"{recording.name} has {plural(recording.count, 'sweep')}, but the window consists of "
-            f"the frames {window.first:,} to {window.last:,}. Use the folder with all frames, or "
-            "one with only the frames of the window."
+            f"{recording.info.name} has {plural(len(recording), 'sweep')}, but the window consists "
+            f"of the frames {window.first:,} to {window.last:,}. Use the folder with all frames, "
+            "or one with only the frames of the window."
         )
-    return recording.section(window.first, window.count)
+    return RecordingSection(recording, window.first, window.count)
 
 
 class Rotation(NamedTuple):
@@ -87,9 +71,8 @@ class RecordedSweeps:
 
     Attributes
     ----------
-    source
-        File of a recording, which each process opens once, or a recording in memory, which cannot
-        be sent to other processes.
+    recording
+        The recording. If it was opened from a file, each process opens the file once.
     rings
         Rings of the sensor, which are empty for a sensor without rings.
     point_times
@@ -103,15 +86,21 @@ class RecordedSweeps:
         been determined.
     isolated
         Range interval in which isolated returns probably come from the air.
+    ref
+        Reference to the file of the recording, or None for a recording in memory.
+    window
+        First frame of the window of LiDAR4D that was selected, or None.
     """
 
-    source: RecordingSelection | Recording
+    recording: Recording
     rings: Rings
     point_times: PointTimes | None
     stamps_s: Floats | None
     lasers: RingLasers
     vehicle: VehicleReturns | None = None
     isolated: IsolatedRanges = NO_RANGES
+    ref: RecordingRef | None = None
+    window: int | None = None
     _kept: dict[int, Sweep] = field(default_factory=dict)
     _air: Mapping[int, Bools] = field(default_factory=dict)
 
@@ -130,8 +119,11 @@ class RecordedSweeps:
         LidarError
             If the recording cannot be read, or if it does not contain the window.
         """
-        file = RecordingSelection(path, sensor, intensity, window)
-        return replace(cls.from_recording(_opened(file)), source=file)
+        recording = with_sweeps(open_recording(path, sensor, intensity))
+        if window is not None:
+            recording = _select_window(recording, WINDOWS[window])
+        ref = RecordingRef(path, sensor, intensity)
+        return replace(cls.from_recording(recording), ref=ref, window=window)
 
     @classmethod
     def from_recording(cls, recording: Recording) -> RecordedSweeps:
@@ -142,36 +134,20 @@ class RecordedSweeps:
         LidarError
             If the recording has no sweeps or no points.
         """
-        if recording.is_cloud or not len(recording):
-            raise LidarError(
-                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
-            )
-        rings = recording.rings
+        rings = with_sweeps(recording).rings
         if not len(rings) and not rings.note and not _has_points(recording):
             raise LidarError(
-                f"{recording.name} contains no points, so there is nothing to reconstruct."
+                f"{recording.info.name} contains no points, so there is nothing to reconstruct."
             )
         lasers = _lasers(recording, rings)
         return cls(recording, rings, recording.point_times, _stamps_s(recording), lasers)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state to send to another process, whose working directory may differ."""
-        state = dict(vars(self))
-        if not isinstance(self.source, Recording):
-            state["source"] = self.source._replace(path=self.source.path.absolute())
-        return state
-
-    @property
-    def recording(self) -> Recording:
-        """Recording that each process opens once."""
-        return self.source if isinstance(self.source, Recording) else _opened(self.source)
 
     @property
     def notes(self) -> list[str]:
         """Notes for the user about information that is missing from the recording."""
         notes = [self.rings.note]
         if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
-            notes.append(self.point_times.clock_note(self.recording.name))
+            notes.append(self.point_times.clock_note(self.recording.info.name))
         return [note for note in notes if note]
 
     @property
@@ -205,10 +181,10 @@ class RecordedSweeps:
 
         Results of stationary sensors count as compensated.
         """
-        recording = self.recording
-        if recording.fired is not None and recording.compensated is None:
+        info = self.recording.info
+        if info.has_firing_poses and info.compensated is None:
             return True
-        return recording.compensated
+        return info.compensated
 
     def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
         """Return a copy that keeps some sweeps in memory.
@@ -403,10 +379,10 @@ def _lasers(recording: Recording, rings: Rings) -> RingLasers:
     if not len(rings):
         return RingLasers.at_origin(rings.elevation_rad)
     numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
-    sweeps = [recording.read_fired(number) for number in numbers]
+    sweeps = [recording.fired(number) for number in numbers]
     used = [(sweep.points, rings.ring_indices(sweep)) for sweep in sweeps if len(sweep)]
     lasers = RingLasers.from_sweeps(used, rings.elevation_rad)
-    if recording.fired is None or recording.compensated is False:
+    if not recording.info.has_firing_poses or recording.info.compensated is False:
         return lasers
     # The sweeps to reconstruct are motion-compensated, unlike the ones that were used.
     return replace(lasers, spread_rad=float("inf"))
@@ -414,7 +390,7 @@ def _lasers(recording: Recording, rings: Rings) -> RingLasers:
 
 def _has_points(recording: Recording) -> bool:
     numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
-    return any(len(recording.read_fired(number)) for number in numbers)
+    return any(len(recording.fired(number)) for number in numbers)
 
 
 def _stamps_s(recording: Recording) -> Floats | None:
@@ -424,14 +400,14 @@ def _stamps_s(recording: Recording) -> Floats | None:
     stamps_s = 1e-9 * recording.stamps_ns
     if len(stamps_s) != len(recording):
         raise LidarError(
-            f"{recording.name} has {plural(len(recording), 'sweep')}, but only "
+            f"{recording.info.name} has {plural(len(recording), 'sweep')}, but only "
             f"{len(stamps_s):,} can be read. Repair the file, or record it again."
         )
     backward = np.flatnonzero(np.diff(stamps_s) <= 0)
     if len(backward):
         number = int(backward[0])
         raise LidarError(
-            f"The timestamps of {recording.name} do not increase: sweep {number:,} is at "
+            f"The timestamps of {recording.info.name} do not increase: sweep {number:,} is at "
             f"{stamps_s[number]:.6f} s, and sweep {number + 1:,} is at "
             f"{stamps_s[number + 1]:.6f} s. Remove repeated sweeps, and sort the others by "
             "timestamp."

@@ -304,7 +304,7 @@ def build_map_with_reflectances(
     response = fit_response(
         [observations],
         sweeps.recorded.ring_count,
-        are_energies=sweeps.recorded.recording.energies,
+        are_energies=sweeps.recorded.recording.info.energies,
     )
     if response is None:
         return surface_map, None

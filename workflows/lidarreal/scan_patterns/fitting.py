@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarfiles.parts.parts import StoredCloud
 from lidarfiles.recordings.opening import as_recording
 from lidarsim._version import __version__
@@ -25,7 +25,7 @@ from lidarsim.sensor_files.format_table import format_of
 from lidarsim.words import plural
 
 from .listed_rays import ListedRays
-from .pattern_returns import PatternReturns
+from .pattern_returns import CloudSweep, PatternReturns
 from .spinning_head import SpinningHead
 from .stationary import check_stationary
 
@@ -101,7 +101,7 @@ def check_pattern_file(path: Path, *, as_rays: bool | None = None) -> None:
 
 
 def fit_pattern(
-    recording: str | Path | Cloud | StoredCloud | Recording,
+    recording: str | Path | Cloud | StoredCloud | Recording | PointCloud,
     *,
     as_rays: bool = False,
     sensor: str | None = None,
@@ -144,17 +144,18 @@ def fit_pattern(
     >>> np.round(fitted.model.beams.elevation_deg[:3])
     array([-15., -13., -11.])
     """
-    recording = as_recording(recording, sensor)
-    returns = PatternReturns.read(recording)
-    notes = [*returns.notes, *check_stationary(recording, returns)]
-    if recording.compensated and recording.fired is None:
+    opened = as_recording(recording, sensor)
+    swept = CloudSweep(opened) if isinstance(opened, PointCloud) else opened
+    returns = PatternReturns.read(swept)
+    notes = [*returns.notes, *check_stationary(swept, returns)]
+    if swept.info.compensated and not swept.info.has_firing_poses:
         notes.append("the recording states that its points are motion-compensated")
-    if "channel" not in _columns(recording) and len(recording.rings):
-        notes.append(recording.rings.note.removesuffix("."))
+    if "channel" not in _columns(swept) and len(swept.rings):
+        notes.append(swept.rings.note.removesuffix("."))
     found = _rays_fit(returns) if as_rays else _head_fit(returns)
     figures = {**found.figures, "notes": [*notes, *found.figures["notes"]]}
     figures["versions"] = {"lidarpool": __version__}
-    table = {"recording": _summary(recording, returns), **figures["table"]}
+    table = {"recording": _summary(swept, returns), **figures["table"]}
     rays = found.rays and replace(found.rays, notes=(*table.values(), *figures["notes"]))
     return replace(found, figures={**figures, "table": table}, rays=rays)
 
@@ -164,7 +165,7 @@ def _columns(recording: Recording) -> Sequence[str]:
 
 
 def _summary(recording: Recording, returns: PatternReturns) -> str:
-    name = Path(recording.name).name
+    name = Path(recording.info.name).name
     return f"{name}: {plural(returns.sweep_count, 'sweep')}, {len(returns):,} returns"
 
 

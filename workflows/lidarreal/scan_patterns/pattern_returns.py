@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording, RecordingInfo, SweepsInMemory
 from lidarfiles.clouds.rings import elevations
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Columns, Sweep
@@ -103,16 +103,14 @@ class PatternReturns:
         LidarError
             If the recording cannot be read, or if it has too few returns.
         """
-        if recording.thinned:
+        if recording.info.thinned:
             raise LidarError(f"{recording.notes[0]}.")
-        is_cloud = recording.is_cloud
-        recording = _single_sweep(recording) if is_cloud else recording
         sweeps = _read_sweeps(recording)
         counts = [len(sweep) for sweep in sweeps]
         if sum(counts) < _MIN_RETURNS:
             raise LidarError(
-                f"{recording.name} has {plural(sum(counts), 'return')}, which is not enough to "
-                f"determine a scan pattern. Record at least {_MIN_RETURNS:,} returns."
+                f"{recording.info.name} has {plural(sum(counts), 'return')}, which is not enough "
+                f"to determine a scan pattern. Record at least {_MIN_RETURNS:,} returns."
             )
         notes = list(recording.notes)
         if len(sweeps) < len(recording):
@@ -121,12 +119,14 @@ class PatternReturns:
         ring, elevation_rad = _rings(recording, sweeps, points)
         sweep_times = _sweep_times(recording, sweeps)
         return cls(
-            recording.name,
+            recording.info.name,
             points,
             np.arange(len(sweeps)).repeat(counts),
             ring,
             _channels(sweeps),
-            _cloud_seconds(sweeps[0]) if is_cloud else _times_s(sweeps, sweep_times),
+            _cloud_seconds(sweeps[0])
+            if isinstance(recording, CloudSweep)
+            else _times_s(sweeps, sweep_times),
             elevation_rad,
             sweep_times,
             tuple(notes),
@@ -137,7 +137,7 @@ def _read_sweeps(recording: Recording) -> list[Sweep]:
     sweeps: list[Sweep] = []
     count = 0
     for number in range(len(recording)):
-        sweep = recording.read_fired(number).replace(number=number)
+        sweep = recording.fired(number).replace(number=number)
         points = sweep.points
         sweeps.append(sweep.select(np.linalg.norm(points, axis=1) > _MIN_RANGE_M))
         count += len(points)
@@ -146,23 +146,27 @@ def _read_sweeps(recording: Recording) -> list[Sweep]:
     return sweeps
 
 
-def _single_sweep(recording: Recording) -> Recording:
-    """Return a recording whose only sweep is a cloud without sweeps, such as a `.ply` file."""
-    if recording.point_count is not None and recording.point_count > _MAX_RETURNS:
-        raise LidarError(
-            f"{recording.name} has {recording.point_count:,} points without sweeps. Use a "
-            f"recording of a few seconds, with at most {_MAX_RETURNS:,} points."
+class CloudSweep(SweepsInMemory):
+    """A cloud without sweeps, such as a `.ply` file, as a recording with a single sweep."""
+
+    def __init__(self, cloud: PointCloud) -> None:
+        info = cloud.info
+        if info.point_count is not None and info.point_count > _MAX_RETURNS:
+            raise LidarError(
+                f"{info.name} has {info.point_count:,} points without sweeps. Use a "
+                f"recording of a few seconds, with at most {_MAX_RETURNS:,} points."
+            )
+        parts = [cloud[number] for number in range(len(cloud))]
+        names = set.intersection(*[set(part.columns) for part in parts]) if parts else set()
+        columns: dict[str, np.ndarray] = {
+            name: np.concatenate([np.asarray(part.columns[name]) for part in parts])
+            for name in names
+        }
+        points = np.concatenate(
+            [np.empty((0, 3)), *(np.asarray(part.points, np.float64) for part in parts)]
         )
-    parts = [recording[number] for number in range(len(recording))]
-    names = set.intersection(*[set(part.columns) for part in parts]) if parts else set()
-    columns: dict[str, np.ndarray] = {
-        name: np.concatenate([np.asarray(part.columns[name]) for part in parts]) for name in names
-    }
-    points = np.concatenate(
-        [np.empty((0, 3)), *(np.asarray(part.points, np.float64) for part in parts)]
-    )
-    sweep = Sweep(points, _with_seconds(columns))
-    return Recording(recording.name, 1, lambda _: sweep, notes=recording.notes)
+        sweep = Sweep(points, _with_seconds(columns))
+        super().__init__(RecordingInfo(info.name, notes=cloud.notes), [sweep])
 
 
 def _with_seconds(columns: dict[str, np.ndarray]) -> Columns:

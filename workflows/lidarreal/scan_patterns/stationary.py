@@ -48,7 +48,7 @@ def check_stationary(recording: Recording, returns: PatternReturns) -> tuple[str
     if speed.turn_deg > 0:
         amounts.append(f"{format_rounded(speed.turn_deg, 2)}°")
     raise LidarError(
-        f"{recording.name} was recorded by a sensor that moves by "
+        f"{recording.info.name} was recorded by a sensor that moves by "
         f"{' and '.join(amounts)} between sweeps. A scan pattern can only be estimated with a "
         "stationary sensor. Record a few seconds without moving the sensor, or use a part of the "
         "recording in which it stands still."
@@ -56,7 +56,7 @@ def check_stationary(recording: Recording, returns: PatternReturns) -> tuple[str
 
 
 def _speed(recording: Recording, returns: PatternReturns) -> Speed | None:
-    if recording.is_cloud or returns.sweep_count < 2:
+    if returns.sweep_count < 2:
         return None
     poses = KnownPoses.from_recording(recording, None, None)
     if poses is not None and poses.are_of_firings(recording):

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.format_table import format_of_path, point_suffixes
-from lidarfiles.clouds.recording import METERS, Recording, RecordingSource
+from lidarfiles.clouds.recording import METERS, PointCloud, Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.environment.extras import reading
@@ -108,7 +109,7 @@ def read_points(
     with explain_os_errors(f"{path} cannot be read"), prefix_errors(path):
         if not check_input(path):
             raise LidarError("it is empty (0 bytes).")
-    recording = cloud_format.open(RecordingSource(path, str(path), as_stored=True))
+    recording = cloud_format.open(RecordingRef(path, as_stored=True))
     with reading(str(path)):
         content = _read_scans(recording, keep_noise)
         if note := content.omitted.omission_note():
@@ -126,7 +127,7 @@ def read_points(
     if points.skipped:
         names = ", ".join(map(printable, points.skipped))
         report(f"{path} has data that surfels cannot store, which were skipped: {names}")
-    system = None if unit is not None else recording.system
+    system = None if unit is not None else recording.info.system
     datum = "" if system is None else system.vertical_datum
     return PlacedPoints(points, placed_epsg, datum)
 
@@ -166,30 +167,30 @@ class _Content(NamedTuple):
     no_returns: int  # number of points at the origin that were skipped
 
 
-def _read_scans(recording: Recording, keep_noise: bool) -> _Content:
+def _read_scans(recording: Recording | PointCloud, keep_noise: bool) -> _Content:
     """Read the scans or parts of a file, and merge them in file coordinates.
 
     Raise LidarError if there is not enough memory for the points.
     """
-    if not len(recording) and not recording.is_cloud:
+    if not len(recording) and not isinstance(recording, PointCloud):
         raise ValueError("it contains no scans")
-    _check_count(recording.point_count or 0)
+    _check_count(recording.info.point_count or 0)
     missing_if_zero: list[Sequence[str]] = [ORIGINS]
-    if len(recording) > 1 and not recording.is_cloud:
+    if len(recording) > 1 and not isinstance(recording, PointCloud):
         # Some programs write zeros for quantities that were not measured in a scan.
         missing_if_zero += [*_INTENSITIES, COLORS]
     scans = []
     omitted = OmittedPoints()
     no_returns = 0
     for number in range(len(recording)):
-        scan = recording.read(number)
-        if not recording.is_cloud:
+        scan = recording.load(number)
+        if not isinstance(recording, PointCloud):
             _check_count(len(scan))
             count = len(scan)
             scan = _without_zeros(scan)
             no_returns += count - len(scan)
-        if recording.noise_classes is not None and not keep_noise:
-            usable, omitted_here = usable_points(scan.columns, recording.noise_classes)
+        if recording.info.noise_classes is not None and not keep_noise:
+            usable, omitted_here = usable_points(scan.columns, recording.info.noise_classes)
             scan = scan if usable is None else scan.select(usable)
             omitted = OmittedPoints(*np.add(omitted, omitted_here).tolist())
         scans.append(_to_file_frame(_with_used_columns(scan, missing_if_zero)))
@@ -266,7 +267,7 @@ def _to_file_frame(scan: Sweep) -> Sweep:
 
 def _to_meters(
     path: Path,
-    recording: Recording,
+    recording: Recording | PointCloud,
     points: Sweep,
     unit: str | None,
     epsg: int | None,
@@ -281,28 +282,28 @@ def _to_meters(
     if epsg is not None:
         if unit is not None:
             raise LidarError("`epsg` and `unit` cannot be combined.")
-        reprojection = Reprojection(recording.system, epsg)
+        reprojection = Reprojection(recording.info.system, epsg)
         reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
         notes = reprojection.notes
         convert = reprojection.apply
         placed_epsg = epsg
     else:
-        if recording.is_metric and unit is None:
-            notes = check_metric_format(recording.system, finite)
+        if recording.info.is_metric and unit is None:
+            notes = check_metric_format(recording.info.system, finite)
             meters = METERS
         elif points.units_m is not None and unit is None:
             meters = points.units_m
             lengths = ", ".join(f"{length:g}" for length in meters)
             notes = [f"was converted to meters, because its header states units of {lengths} m"]
-        elif recording.meters != METERS and unit is None:
-            meters = recording.meters
+        elif recording.info.meters != METERS and unit is None:
+            meters = recording.info.meters
             notes = []
         else:
-            meters, notes = stated_meters(recording.system, finite, unit)
+            meters, notes = stated_meters(recording.info.system, finite, unit)
         convert = partial(np.multiply, meters)
         placed_epsg = None
-        if recording.system is not None and unit is None and meters == METERS:
-            placed_epsg = recording.system.epsg_in_meters
+        if recording.info.system is not None and unit is None and meters == METERS:
+            placed_epsg = recording.info.system.epsg_in_meters
     for note in notes:
         report(f"{path} {note}")
     return convert, placed_epsg

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -12,6 +12,68 @@ from ..numerics.arrays import AnyArray, Bools, Floats, Indices, Ints32
 from .column_names import STRENGTHS
 
 Columns = Mapping[str, AnyArray]
+
+
+class SweepFacts(Protocol):
+    """What a recording knows about the points of its sweeps that is not stored in columns."""
+
+    def rings_of(self, sweep: Sweep, /) -> AnyArray | None:
+        """Return the ring of each point, or None if the rings are unknown."""
+
+    def times_of(self, sweep: Sweep, /) -> Floats | None:
+        """Return each point's time relative to the timestamp of the sweep, or None if unknown."""
+
+
+class SensorPoses(Protocol):
+    """Poses of a sensor at the firing times of k points.
+
+    `lidarsim.sweeps.sweep_motion.FiringPoses` describes the attributes.
+    """
+
+    @property
+    def position(self) -> Floats:
+        """World coordinates at the start of the sweep, in meters, of shape (3,)."""
+
+    @property
+    def rotation(self) -> Floats:
+        """Rotation from the sensor frame at the start of the sweep to the world frame."""
+
+    @property
+    def offsets(self) -> Floats | None:
+        """Displacements from `position` in meters, of shape (3, k), or None."""
+
+    @property
+    def quaternions(self) -> Floats | None:
+        """Rotations since the start of the sweep, of shape (4, k), or None."""
+
+    def select(self, rows: Any) -> SensorPoses:
+        """Return the poses of the selected points."""
+
+    def to_world(self, points: Floats) -> Floats:
+        """Transform points from the sensor frame at their firing times to the world frame."""
+
+
+class BoundingBoxes(Protocol):
+    """Bounding boxes of k actors (`lidarfiles.clouds.boxes.SweepBoxes`)."""
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types of the actors, such as "Car"."""
+
+    @property
+    def objects(self) -> Ints32:
+        """Numbers of the actors in the column `object`, of shape (k,)."""
+
+    @property
+    def rows(self) -> AnyArray:
+        """Center, length, width, height and yaw of each box, of shape (k, 7)."""
+
+    @property
+    def visibility(self) -> Mapping[str, AnyArray]:
+        """Visibility of the actors, if it is known."""
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
 
 
 class Sweep:
@@ -57,7 +119,7 @@ class Sweep:
         Notes on the points, phrased as clauses that follow the file name.
     skipped
         Names of columns in the file that could not be read.
-    recording
+    facts
         Recording to which the sweep belongs. It determines `rings` and `times_s` if the file does
         not contain them.
     """
@@ -70,10 +132,10 @@ class Sweep:
         pose: Floats | Callable[[], Floats | None] | None = None,
         time_ns: int | float | None = None,
         compensated: bool | None = None,
-        firing_poses: Any = None,
+        firing_poses: SensorPoses | None = None,
         scanner: Floats | None = None,
         units_m: tuple[float, float, float] | None = None,
-        boxes: Any = None,
+        boxes: BoundingBoxes | Callable[[], BoundingBoxes | None] | None = None,
         sensor: str = "",
         number: int = 0,
         job: str = "",
@@ -84,7 +146,7 @@ class Sweep:
         faults: tuple[Any, ...] = (),
         notes: Sequence[str] = (),
         skipped: Sequence[str] = (),
-        recording: Any = None,
+        facts: SweepFacts | None = None,
     ) -> None:
         self.points = points
         self.columns: Columns = {} if columns is None else columns
@@ -105,18 +167,18 @@ class Sweep:
         self.skipped = skipped
         self._pose = pose
         self._boxes = boxes
-        self._recording = recording
+        self._facts = facts
         # The sweep from which these points were selected or transformed, and their rows in it. The
         # recording determines rings and times from that sweep.
         self._origin: tuple[Self, Bools | Indices | slice] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # The recording is not pickled, so the values that it determines are computed now.
-        known = None if self._recording is None else _RingsAndTimes(self.rings, self.times_s)
+        # A recording is not pickled with its sweep, so what it determines is computed now.
+        known = None if self._facts is None else _RingsAndTimes(self.rings, self.times_s)
         return self.__dict__ | {
             "_pose": self.pose,
             "_boxes": self.boxes,
-            "_recording": known,
+            "_facts": known,
             "_origin": None,
         }
 
@@ -137,9 +199,9 @@ class Sweep:
         other = object.__new__(type(self))
         cached = ("pose", "boxes", "rings", "times_s")
         other.__dict__ |= {k: v for k, v in self.__dict__.items() if k not in cached}
-        if "recording" in changes:
+        if "facts" in changes:
             other._origin = None
-        elif "points" in changes and self._recording is not None:
+        elif "points" in changes and self._facts is not None:
             other._origin = self, slice(None)
         for name, value in changes.items():
             attribute = name if name in other.__dict__ else f"_{name}"
@@ -158,9 +220,10 @@ class Sweep:
         return pose
 
     @cached_property
-    def boxes(self) -> Any:
+    def boxes(self) -> BoundingBoxes | None:
         """Bounding boxes of the actors in the sensor frame, or None if they are unknown."""
-        return self._boxes() if callable(self._boxes) else self._boxes
+        boxes: BoundingBoxes | None = self._boxes() if callable(self._boxes) else self._boxes
+        return boxes
 
     @cached_property
     def rings(self) -> AnyArray | None:
@@ -175,7 +238,7 @@ class Sweep:
         if self._origin is not None:
             sweep, rows = self._origin
             return None if sweep.rings is None else sweep.rings[rows]
-        return None if self._recording is None else self._recording.rings_of(self)
+        return None if self._facts is None else self._facts.rings_of(self)
 
     @cached_property
     def times_s(self) -> Floats | None:
@@ -186,7 +249,7 @@ class Sweep:
         if self._origin is not None:
             sweep, rows = self._origin
             return None if sweep.times_s is None else sweep.times_s[rows]
-        return None if self._recording is None else self._recording.times_of(self)
+        return None if self._facts is None else self._facts.times_of(self)
 
     @property
     def intensity(self) -> AnyArray | None:
@@ -240,7 +303,7 @@ class Sweep:
             columns=columns,
             firing_poses=None if poses is None else poses.select(rows),
         )
-        if self._recording is not None:
+        if self._facts is not None:
             selected._origin = self, rows
         return selected
 
@@ -252,7 +315,7 @@ class Sweep:
         """
         return self.replace(
             columns={name: values for name, values in columns.items() if values is not None},
-            recording=None,
+            facts=None,
         )
 
     def in_world(self) -> Floats:

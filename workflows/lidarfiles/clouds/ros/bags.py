@@ -46,7 +46,9 @@ from ..frame_names import WORLD, survey_start_ns
 from ..job_reader import JobReader
 from ..point_field import OMITTED, PointField
 from ..recorded_boxes import RecordedBoxes
-from ..recording import Recording, RecordingSource, sweep_from_columns
+from ..recording import Recording, sweep_from_columns
+from ..recording_ref import RecordingRef
+from ..sequential_recording import SequentialRecording
 from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
@@ -195,9 +197,9 @@ class Rosbag2(CloudFormat):
         return [note] if survey.keep_every > 1 and laser_scan.has_planar_sensors(survey) else []
 
     @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
+    def open(cls, ref: RecordingRef) -> Recording:
         """Open a topic with PointCloud2 or Livox CustomMsg messages in a bag."""
-        return _open_bag(source)
+        return _BagRecording(ref)
 
 
 class MCAP(Rosbag2):
@@ -300,7 +302,7 @@ def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> 
     return fired_in_sensor.compensate_motion(sweep, sensor_cloud).astype(np.float32)
 
 
-def point_connection(source: RecordingSource, bag: Any) -> Any:
+def point_connection(ref: RecordingRef, bag: Any) -> Any:
     """Return the connection of a bag whose messages are the sweeps of a recording.
 
     A topic with Livox CustomMsg messages is selected if the user chose it, or if the bag has no
@@ -316,62 +318,72 @@ def point_connection(source: RecordingSource, bag: Any) -> Any:
         for connection in bag.connections
         if connection.msgtype in LIVOX_CLOUDS
     }
-    topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
-    chosen = topics[source.choose("PointCloud2 topics", topics)]
+    topics = livox_clouds if ref.sensor in livox_clouds else clouds or livox_clouds
+    chosen = topics[ref.choose("PointCloud2 topics", topics)]
     return chosen._replace(owner=None)  # the bag that contains the connection cannot be pickled
 
 
-def _open_bag(source: RecordingSource) -> Recording:
-    """Open a topic of a bag.
+class _BagRecording(SequentialRecording):
+    """A topic of a bag. Each message is a sweep in the frame of its header."""
 
-    Each message is a sweep in the frame of its header.
-    """
-    bags = PerProcess(partial(open_bag, source.path, source.name))
-    connection = point_connection(source, bags())
-    columns_of = livox_columns if connection.msgtype in LIVOX_CLOUDS else point_columns
+    def __init__(self, ref: RecordingRef) -> None:
+        self._path = ref.path
+        self._bags = PerProcess(partial(open_bag, ref.path, ref.name))
+        self._connection = connection = point_connection(ref, self._bags())
+        with reading(ref.name):
+            # The timestamp is zero if the recording program did not set it.
+            first = islice(self.stored_sweeps(), 2)
+            self._is_stamped = any(header_of(data).stamp_ns for _, _, data in first)
+        custom_data = _custom_data(ref.path)
+        unstamped = () if self._is_stamped or not connection.msgcount else (_UNSTAMPED,)
+        info = ref.info(
+            sensor=connection.topic,
+            compensated=states_compensation(custom_data),
+            energy_unit=_energy_unit(custom_data, connection, ref.intensity),
+            notes=ref.prefix_notes((*unstamped, *_split_notes(ref.path))),
+        )
+        super().__init__(info, connection.msgcount)
+        self._pose_notes: tuple[str, ...] = ()  # found while the poses were read
 
-    def messages() -> Iterator[Any]:
-        return bags().messages([connection])
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return (*self.info.notes, *self._pose_notes)
 
-    def convert(message: Any) -> Sweep:
-        _, recorded_ns, data = message
-        stamp_ns = header_of(data).stamp_ns if is_stamped else recorded_ns
-        return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
+    def stored_sweeps(self) -> Iterator[Any]:
+        return self._bags().messages([self._connection])
 
-    with reading(source.name):
-        # The timestamp is zero if the recording program did not set it.
-        is_stamped = any(header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
+    def convert(self, stored: Any) -> Sweep:
+        _, recorded_ns, data = stored
+        stamp_ns = header_of(data).stamp_ns if self._is_stamped else recorded_ns
+        is_livox = self._connection.msgtype in LIVOX_CLOUDS
+        columns = livox_columns(data) if is_livox else point_columns(data)
+        return sweep_from_columns(columns, time_ns=float(stamp_ns))
 
-    def headers() -> Iterator[MessageHeader]:
-        for _, recorded_ns, data in messages():
-            header = header_of(data)
-            yield header if is_stamped else header._replace(stamp_ns=recorded_ns)
+    def _headers(self) -> list[MessageHeader]:
+        with self.lock:
+            headers = []
+            for _, recorded_ns, data in self.stored_sweeps():
+                header = header_of(data)
+                headers.append(
+                    header if self._is_stamped else header._replace(stamp_ns=recorded_ns)
+                )
+            return headers
 
-    def read_stamps() -> Iterator[float]:
-        return (float(header.stamp_ns) for header in headers())
+    def load_stamps(self) -> list[float]:
+        return [float(header.stamp_ns) for header in self._headers()]
 
-    custom_data = _custom_data(source.path)
-    unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
-    notes = [*source.prefix_notes((*unstamped, *_split_notes(source.path)))]
-
-    def read_poses() -> Floats | None:
-        poses, clauses = _sweep_poses(source.path, [*headers()])
-        notes.extend(note for note in source.prefix_notes(clauses) if note not in notes)
+    def load_poses(self) -> Floats | None:
+        poses, clauses = _sweep_poses(self._path, self._headers())
+        self._pose_notes = tuple(f"{self.info.name} {clause}" for clause in clauses)
         return poses
 
-    return source.stream(
-        messages,
-        convert,
-        connection.msgcount,
-        read_stamps=read_stamps,
-        read_poses=read_poses,
-        read_classes=lambda: _class_names(bags()),
-        read_boxes=lambda: _boxes(bags(), [*headers()], read_poses()),
-        notes=notes,
-        compensated=states_compensation(custom_data),
-        energy_unit=_energy_unit(custom_data, connection, source.intensity),
-        sensor=connection.topic,
-    )
+    def load_classes(self) -> dict[int, str]:
+        with self.lock:
+            return _class_names(self._bags())
+
+    def load_boxes(self) -> RecordedBoxes | None:
+        with self.lock:
+            return _boxes(self._bags(), self._headers(), self._stored_poses)
 
 
 def _split_notes(path: Path) -> tuple[str, ...]:

@@ -17,7 +17,8 @@ from zlib import crc32
 import numpy as np
 import yaml
 
-from lidarfiles.clouds.recording import Recording, RecordingSource, sweep_from_columns
+from lidarfiles.clouds.recording import Recording, sweep_from_columns
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.ros.bags import header_of, point_connection
 from lidarfiles.processes.per_process import PerProcess
 from lidarsim.columns.bags import (
@@ -62,9 +63,9 @@ class BagRewriter(Rewriter):
 
     title = "ROS 2"
 
-    def __init__(self, source: RecordingSource, recording: Recording) -> None:
-        super().__init__(source, recording)
-        self._messages = PerProcess(partial(_TopicMessages, source))
+    def __init__(self, ref: RecordingRef, recording: Recording) -> None:
+        super().__init__(ref, recording)
+        self._messages = PerProcess(partial(_TopicMessages, ref))
 
     def encode(
         self, number: int, augmented: AugmentedSweep
@@ -128,23 +129,21 @@ class BagRewriter(Rewriter):
     def _stored(self, number: int, records: Any) -> StoredRecords:
         """Combine the records of a message with its points, without reading the bag again."""
         columns = {name: records[name] for name in records.dtype.names or ()}
-        sweep = sweep_from_columns(columns)
-        recording = replace_fields(self.recording, read=lambda _: sweep, read_poses=None)
-        return StoredRecords(
-            records, recording[number], recording.meters, recording.intensity_column
-        )
+        sweep = self.recording.standardize(number, sweep_from_columns(columns))
+        info = self.recording.info
+        return StoredRecords(records, sweep, info.meters, info.intensity_column)
 
     def sensors(self) -> list[str]:
         """Return the topics with points."""
-        with opened_bag(self.path, self.source.name) as bag:
+        with opened_bag(self.path, self.ref.name) as bag:
             topics = {c.topic for c in bag.connections if c.msgtype in _POINT_TYPES}
         return sorted(topics)
 
     @cached_property
     def sensor(self) -> str:
         """Topic with the sweeps."""
-        with opened_bag(self.path, self.source.name) as bag:
-            return str(point_connection(self.source, bag).topic)
+        with opened_bag(self.path, self.ref.name) as bag:
+            return str(point_connection(self.ref, bag).topic)
 
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the bag, message by message."""
@@ -154,8 +153,8 @@ class BagRewriter(Rewriter):
             base = target.with_name(f"previous-{target.name}")
             target.rename(base)
         has_boxes = any(sweep["boxes"] for sweep in encoded.details())
-        with opened_bag(base, self.source.name) as bag:
-            bag_copy = _BagCopy(bag, base, target, point_connection(self.source, bag), encoded)
+        with opened_bag(base, self.ref.name) as bag:
+            bag_copy = _BagCopy(bag, base, target, point_connection(self.ref, bag), encoded)
             topic = bag_copy.write(has_boxes=has_boxes)
             if self.path.is_dir():
                 notes += copy_data_set(base, target, bag_copy.files())
@@ -184,7 +183,7 @@ class _TopicMessages:
     A bag can only be read from its start, so reading messages in ascending order is fastest.
     """
 
-    source: RecordingSource
+    ref: RecordingRef
     _next: int = field(default=0, init=False)
     _remaining: Iterator[Any] = field(default_factory=lambda: iter(()), init=False)
     _bag: Any = field(default=None, init=False)
@@ -197,8 +196,8 @@ class _TopicMessages:
         """
         with self._lock:
             if not 0 < self._next <= number:
-                self._bag = self._bag or open_bag(self.source.path, self.source.name)
-                connection = point_connection(self.source, self._bag)
+                self._bag = self._bag or open_bag(self.ref.path, self.ref.name)
+                connection = point_connection(self.ref, self._bag)
                 self._remaining = self._bag.messages([connection])
                 self._next = 0
             skipped = number - self._next

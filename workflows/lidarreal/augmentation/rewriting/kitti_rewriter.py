@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.kitti import CALIBRATION_FILE, MAX_INSTANCES, point_files, sequence_folders
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input, read_input_text
 from lidarsim.numerics.arrays import Ints
@@ -36,10 +37,10 @@ class KittiRewriter(Rewriter):
 
     title = "KITTI"
 
-    def __init__(self, source: RecordingSource, recording: Recording) -> None:
-        super().__init__(source, recording)
+    def __init__(self, ref: RecordingRef, recording: Recording) -> None:
+        super().__init__(ref, recording)
         if self.path.is_dir():
-            self._folder, points = sequence_folders(self.path)[recording.sequence]
+            self._folder, points = sequence_folders(self.path)[recording.info.sequence]
             self._files = point_files(points)
         else:
             self._folder = self.path.parent.parent
@@ -104,7 +105,7 @@ class KittiRewriter(Rewriter):
     @property
     def sensor(self) -> str:
         """Name of the sequence."""
-        return self.recording.sequence
+        return self.recording.info.sequence
 
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the file, or the folder with all files of the data set."""
@@ -137,12 +138,12 @@ class KittiRewriter(Rewriter):
             has_labels |= "labels" in sweep
         if unlabeled and (self._folder / "labels").is_dir():
             notes.append(
-                f"{self.source.name} has no {list_names(unlabeled)} in the folder `labels`, so the "
+                f"{self.ref.name} has no {list_names(unlabeled)} in the folder `labels`, so the "
                 "points of these sweeps are not labeled in the copy."
             )
         if boxes and not has_labels:
             notes.append(
-                f"{self.source.name} has no folder `label_2`, so the boxes of inserted objects are "
+                f"{self.ref.name} has no folder `label_2`, so the boxes of inserted objects are "
                 "not stored."
             )
         elif labels < boxes:
@@ -156,7 +157,7 @@ class KittiRewriter(Rewriter):
             )
         if not (self._folder / "labels").is_dir() and boxes:
             notes.append(
-                f"{self.source.name} has no semantic labels, so the classes of inserted points are "
+                f"{self.ref.name} has no semantic labels, so the classes of inserted points are "
                 "not stored."
             )
         return notes

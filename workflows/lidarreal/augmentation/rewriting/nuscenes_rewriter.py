@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarfiles.clouds.nuscenes import NuScenesTables, tables_folder
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarsim.errors import LidarError
 from lidarsim.io.archives import pack_arrays
 from lidarsim.io.input_files import read_input
@@ -46,13 +47,13 @@ class NuScenesRewriter(Rewriter):
 
     title = "nuScenes"
 
-    def __init__(self, source: RecordingSource, recording: Recording) -> None:
-        super().__init__(source, recording)
-        folder = tables_folder(source)
+    def __init__(self, ref: RecordingRef, recording: Recording) -> None:
+        super().__init__(ref, recording)
+        folder = tables_folder(ref)
         self.path = folder.parent
         self._tables = NuScenesTables(folder)
         self._lidars = self._tables.lidar_rows()
-        self._channel = source.choose("sensors", self._lidars)
+        self._channel = ref.choose("sensors", self._lidars)
         self._rows = self._lidars[self._channel]
         self._categories = list(self._tables.table("category", optional=True).values())
         self._panoptic: dict[str, str] = {}  # {token of a sweep: its file}
@@ -126,7 +127,7 @@ class NuScenesRewriter(Rewriter):
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the folder with all files of the data set."""
         folder = self._tables.folder.name
-        tables = _AnnotationTables(NuScenesTables(base / folder), self._rows, self.source.name)
+        tables = _AnnotationTables(NuScenesTables(base / folder), self._rows, self.ref.name)
         files = encoded.files()
         notes = [] if base == target else copy_data_set(base, target, files)
         for name, path in files.items():

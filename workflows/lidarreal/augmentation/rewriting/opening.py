@@ -9,7 +9,8 @@ from lidarfiles.clouds.format_table import format_of_path
 from lidarfiles.clouds.kitti import KITTI
 from lidarfiles.clouds.nuscenes import NuScenes
 from lidarfiles.clouds.pcd import PCD
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import PointCloud, Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.ros.bags import Rosbag2
 from lidarfiles.datasets.dataset import INDEX_FILE
 from lidarsim.errors import LidarError
@@ -26,53 +27,50 @@ _FORMATS = "KITTI, nuScenes, PCD, MCAP and rosbag2"
 _REMEDY = "Choose another format with `--format`, for example `--format mcap`."
 
 
-def open_rewriter(source: str | Path, recording: Recording, sensor: str | None = None) -> Rewriter:
+def open_rewriter(ref: RecordingRef, recording: Recording) -> Rewriter:
     """Return the rewriter that writes an augmented copy of a recording in its own format.
 
     Parameters
     ----------
-    source
-        File or folder of the recording.
+    ref
+        Reference to the recording, whose path is valid in this process.
     recording
         The recording, opened with `keep_noise=True`.
-    sensor
-        Sensor or topic that the user chose, or None if there is only one.
 
     Raises
     ------
     LidarError
         If recordings in this format cannot be rewritten.
     """
-    path = Path(source)
-    opened = RecordingSource(path, str(source), sensor, recording.intensity_column)
+    path = ref.path
     if (path / INDEX_FILE).exists():
         raise LidarError(
-            f"{source} is a data set of lidarpool, whose jobs cannot be rewritten. {_REMEDY}"
+            f"{ref.name} is a data set of lidarpool, whose jobs cannot be rewritten. {_REMEDY}"
         )
-    cloud_format = format_of_path(path, str(source))
+    cloud_format = format_of_path(path, ref.name)
     if cloud_format is KITTI:
-        return KittiRewriter(opened, recording)
+        return KittiRewriter(ref, recording)
     if cloud_format is PCD:
-        return PCDRewriter(opened, recording)
+        return PCDRewriter(ref, recording)
     if cloud_format is NuScenes:
-        return NuScenesRewriter(opened, recording)
+        return NuScenesRewriter(ref, recording)
     if cloud_format is not None and issubclass(cloud_format, Rosbag2):
-        return BagRewriter(opened, recording)
+        return BagRewriter(ref, recording)
     kind = cloud_format.title if cloud_format is not None and cloud_format.title else "this format"
     if contained := _rewritable_entries(path):
-        raise LidarError(f"{source} cannot be rewritten in {kind}. {_pass_one_of(contained)}")
+        raise LidarError(f"{ref.name} cannot be rewritten in {kind}. {_pass_one_of(contained)}")
     raise LidarError(
-        f"{source} cannot be augmented in its own format. Recordings can be rewritten in the "
+        f"{ref.name} cannot be augmented in its own format. Recordings can be rewritten in the "
         f"formats {_FORMATS}, but not in {kind}. {_REMEDY}"
     )
 
 
-def check_sweeps(source: str | Path, recording: Recording) -> None:
+def check_sweeps(source: str | Path, recording: Recording | PointCloud) -> None:
     """Raise LidarError if a recording contains no sweeps.
 
     The message names recordings in the folder `source` that may contain some.
     """
-    if not recording.is_cloud and len(recording):
+    if not isinstance(recording, PointCloud) and len(recording):
         return
     contained = _rewritable_entries(Path(source))
     remedy = _pass_one_of(contained) if contained else "Use a recording that consists of sweeps."

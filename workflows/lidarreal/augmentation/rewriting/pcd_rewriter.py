@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.pcd import point_files
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarsim.io.input_files import read_input
 from lidarsim.scene.files.pcd import PCDRecords
 
@@ -27,8 +28,8 @@ class PCDRewriter(Rewriter):
 
     title = "PCD"
 
-    def __init__(self, source: RecordingSource, recording: Recording) -> None:
-        super().__init__(source, recording)
+    def __init__(self, ref: RecordingRef, recording: Recording) -> None:
+        super().__init__(ref, recording)
         self._files = point_files(self.path)
 
     def encode(

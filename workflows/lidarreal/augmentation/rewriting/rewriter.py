@@ -16,7 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidarfiles.clouds.recording import Recording, RecordingSource
+from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.words import list_names, plural
@@ -75,17 +76,17 @@ class Rewriter(ABC):
 
     Parameters
     ----------
-    source
-        File or folder of the recording.
+    ref
+        Reference to the recording, whose path is valid in this process.
     recording
         The recording, opened with `keep_noise=True`.
     """
 
     title: ClassVar[str] = ""  # proper name of the format
 
-    def __init__(self, source: RecordingSource, recording: Recording) -> None:
-        self.source = source
-        self.path = source.path
+    def __init__(self, ref: RecordingRef, recording: Recording) -> None:
+        self.ref = ref
+        self.path = ref.path
         self.recording = recording
 
     @abstractmethod
@@ -138,7 +139,7 @@ class Rewriter(ABC):
         LidarError
             If the sweep cannot be read, or if the format cannot store its points.
         """
-        with reading(self.recording.name):
+        with reading(self.recording.info.name):
             files, details = self.encode(number, augmented)
         details |= {"number": number, "files": sorted(files), "points": len(augmented.sweep)}
         return files | {DETAILS_FILE: json.dumps(details).encode()}
@@ -196,7 +197,7 @@ class Rewriter(ABC):
         notes = self._sensor_notes([rewriter.sensor for rewriter, _ in parts])
         base = self.path
         for rewriter, sweeps in parts:
-            with reading(self.source.name):
+            with reading(self.ref.name):
                 notes += rewriter.assemble(target, sweeps, base)
             base = target
         if target.is_dir():
@@ -212,7 +213,7 @@ class Rewriter(ABC):
         return [
             (
                 f"Only the sweeps of {list_names(chosen)} were augmented. {list_names(unchanged)} "
-                f"in {self.source.name} {verb} unchanged."
+                f"in {self.ref.name} {verb} unchanged."
             )
         ]
 
@@ -220,7 +221,7 @@ class Rewriter(ABC):
         """Combine the records of a file with the points of the recording."""
         recording = self.recording
         return StoredRecords(
-            records, recording[number], recording.meters, recording.intensity_column
+            records, recording[number], recording.info.meters, recording.info.intensity_column
         )
 
 

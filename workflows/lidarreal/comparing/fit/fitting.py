@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarfiles.parts.parts import StoredCloud
-from lidarfiles.recordings.opening import as_recording
+from lidarfiles.recordings.opening import as_recording, with_sweeps
 from lidarfiles.work.publishing import publishing
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
@@ -80,7 +80,7 @@ class Fit:
 
 
 def fit(
-    recording: str | Path | Cloud | StoredCloud | Recording,
+    recording: str | Path | Cloud | StoredCloud | Recording | PointCloud,
     *,
     model: str | Path | None = None,
     scene: str | Path | Scene | None = None,
@@ -130,30 +130,30 @@ def fit(
     if white is not None:
         check_number("white", white, gt=0)
     named = None if model is None else read_model(model)  # before the recording, which takes long
-    recording = as_recording(recording, sensor, intensity)
-    check_sweeps(recording)
+    opened = with_sweeps(as_recording(recording, sensor, intensity))
+    check_sweeps(opened)
     loaded = Scene.load(scene) if isinstance(scene, str | Path) else scene
-    poses = KnownPoses.from_recording(recording, pose, loaded)
-    speed = None if poses is None else poses.speed(recording)
+    poses = KnownPoses.from_recording(opened, pose, loaded)
+    speed = None if poses is None else poses.speed(opened)
     if poses is None or speed is None:
-        measured = measure_standing(recording, white, loaded, poses)
+        measured = measure_standing(opened, white, loaded, poses)
     elif loaded is None:
         raise LidarError(
             moving_message(
-                recording.name,
+                opened.info.name,
                 speed,
                 "Pass a mesh of the scene to which its poses refer with `--scene`",
             )
         )
     else:
-        measured = measure_moving(recording, white, loaded, poses)
+        measured = measure_moving(opened, white, loaded, poses)
     base = recorded_sensor(measured.stack) if named is None else named
-    return _fit_of(recording, measured, base)
+    return _fit_of(opened, measured, base)
 
 
 def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel) -> Fit:
     stack = measured.stack
-    name = Path(recording.name).name
+    name = Path(recording.info.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
     estimates = measured.estimates
     notes = list(stack.notes)

@@ -60,7 +60,7 @@ class KnownPoses:
                     "scene. Set `scene`, or omit `pose`."
                 )
             return cls(np.arange(len(matrices)), matrices, True, origin)
-        numbers = even_indices(recording.count, _MAX_SWEEPS)
+        numbers = even_indices(len(recording), _MAX_SWEEPS)
         recorded = recording.poses(numbers.tolist())
         if recorded is None:
             return None
@@ -69,7 +69,7 @@ class KnownPoses:
 
     def are_of_firings(self, recording: Recording) -> bool:
         """Return True if each firing has its own pose, as in a result of lidarpool."""
-        return not self.are_given and recording.fired is not None
+        return not self.are_given and recording.info.has_firing_poses
 
     def speed(self, recording: Recording) -> Speed | None:
         """Return the mean motion between consecutive sweeps, or None if the sensor stands still."""
@@ -85,7 +85,7 @@ class KnownPoses:
         sweeps = int(self.numbers[-1] - self.numbers[0])
         steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         turns_deg = _angles_deg(rotations[:-1], rotations[1:])
-        period_ns = sweep_period_ns(recording, np.arange(recording.count))
+        period_ns = sweep_period_ns(recording, np.arange(len(recording)))
         shift_m = float(steps_m.sum() / sweeps)
         turn_deg = float(turns_deg.sum() / sweeps)
         return Speed(shift_m, turn_deg if turn_deg > _MIN_SPEED_DEG else 0.0, period_ns)
@@ -100,8 +100,9 @@ class KnownPoses:
             return self._of_whole_sweeps(recording)
 
         def read_in_scene(number: int) -> Sweep:
-            sweep = recording.read_fired(number)
+            sweep = recording.fired(number)
             poses = sweep.firing_poses
+            assert isinstance(poses, FiringPoses)
             poses = replace(poses, position=poses.position - self.origin)
             return with_compared_columns(sweep).replace(firing_poses=poses)
 
@@ -111,10 +112,10 @@ class KnownPoses:
         """Return a function that reads a sweep and assigns the sweep's pose to all its pulses."""
         matrices = self.matrices
         if not self.are_given:
-            recorded = recording.poses(range(recording.count))
+            recorded = recording.poses(range(len(recording)))
             if recorded is None:
                 raise LidarError(
-                    f"{recording.name} does not contain a pose for every sweep. Pass `--pose`."
+                    f"{recording.info.name} does not contain a pose for every sweep. Pass `--pose`."
                 )
             matrices = recorded
             matrices[:, :3, 3] -= self.origin
@@ -139,10 +140,10 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
         matrices = np.array(
             [affine(pose.rotation_matrix, np.array(pose.position)) for pose in poses]
         )
-    if len(matrices) not in (1, recording.count):
+    if len(matrices) not in (1, len(recording)):
         raise LidarError(
-            f"`pose` contains {plural(len(matrices), 'pose')}, but {recording.name} has "
-            f"{plural(recording.count, 'sweep')}. Pass one pose, or one pose for each sweep."
+            f"`pose` contains {plural(len(matrices), 'pose')}, but {recording.info.name} has "
+            f"{plural(len(recording), 'sweep')}. Pass one pose, or one pose for each sweep."
         )
     return matrices
 

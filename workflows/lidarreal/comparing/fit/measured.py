@@ -120,15 +120,15 @@ def measure_standing(
         expected = _scene_ranges(stack, scene, poses)
         difference = np.abs(finite_median(stack.ranges, 0) - expected)
         near_count = (difference < SCENE_TOLERANCE_M).sum()
-        _check_pose(near_count / max(np.isfinite(difference).sum(), 1), recording.name)
+        _check_pose(near_count / max(np.isfinite(difference).sum(), 1), recording.info.name)
         lost_by_range = _lost_by_range(stack, expected)
     sigma = stack.rough_sigma.copy()
     estimates: dict[str, Estimate] = {}
     for _ in range(2):  # the second pass excludes outliers based on the noise from the first pass
         direction_noise_rad = 0.0 if estimates else ASSUMED_DIRECTION_NOISE_RAD
         rays = select_smooth_rays(stack, sigma, direction_noise_rad, expected)
-        _check_rays(len(rays.row), recording.name)
-        energy = _pulse_energies(rays, white or recording.white, recording.energies)
+        _check_rays(len(rays.row), recording.info.name)
+        energy = _pulse_energies(rays, white or recording.info.white, recording.info.energies)
         if stack.sweep_count > 1:
             estimates, sigma[rays.row, rays.column] = fit_performance(rays, energy)
     if estimates and (alarms := alarm_share(stack)):
@@ -146,16 +146,16 @@ def measure_moving(
     in the scene, or if too few pulses hit smooth surfaces.
     """
     stack, sweeps = measure_pulses(recording, scene, poses.sweep_reader(recording))
-    _check_pose(sweeps.near / max(sweeps.compared, 1), recording.name)
+    _check_pose(sweeps.near / max(sweeps.compared, 1), recording.info.name)
     pulses = sweeps.pulses
     if np.isfinite(stack.intensities).any():
         pulses = pulses.select(np.isfinite(pulses.intensity))
-    _check_rays(np.isfinite(pulses.difference).sum(), recording.name)
+    _check_rays(np.isfinite(pulses.difference).sum(), recording.info.name)
     pulses = pulses.select(pulses.near_scene(pulses.rough_sigma()))
     sigma = pulses.rough_sigma()
     for _ in range(2):  # the second pass excludes outliers based on the noise from the first pass
         rays = pulses.rays(sigma)
-        energy = _pulse_energies(rays, white or recording.white, recording.energies)
+        energy = _pulse_energies(rays, white or recording.info.white, recording.info.energies)
         estimates, sigma = fit_performance(rays, energy, all_known=True)
     lost = 1 - rays.return_counts.astype(np.float64)
     bias = _pulse_bias(pulses)

@@ -359,6 +359,7 @@ def _pulses_of_sweep(
 def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
     """Return the sensor position and rotation at the firing of each point."""
     poses = fired.firing_poses
+    assert poses is not None
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)
         rotations = np.broadcast_to(poses.rotation, (count, 3, 3))

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidarfiles.clouds.recording import Recording
+from lidarfiles.recordings.opening import with_sweeps
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
@@ -85,13 +86,13 @@ class SweepStack:
         read = read or partial(compared_sweep, recording)
         cells = _CommonCells.read(recording, read)
         notes = [*recording.notes, *cells.ring_notes]
-        if len(cells.numbers) < recording.count:
+        if len(cells.numbers) < len(recording):
             notes.append(
-                f"{len(cells.numbers):,} evenly spaced sweeps out of {recording.count:,} are used"
+                f"{len(cells.numbers):,} evenly spaced sweeps out of {len(recording):,} are used"
             )
         for index, number in enumerate(cells.numbers.tolist()):
             sweep = read(number)
-            with prefix_errors(recording.name):
+            with prefix_errors(recording.info.name):
                 cells.add_sweep(index, sweep)
         elevation_deg, values = cells.sorted_by_elevation()
         covered = covered_cells(np.isfinite(values[0]))
@@ -120,12 +121,9 @@ class SweepStack:
 
 def check_sweeps(recording: Recording) -> None:
     """Raise LidarError unless the recording has sweeps that contain all returns."""
-    if recording.thinned:
+    if recording.info.thinned:
         raise LidarError(f"{recording.notes[0]}.")
-    if recording.is_cloud or not recording.count:
-        raise LidarError(
-            f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
-        )
+    with_sweeps(recording)
 
 
 @dataclass(eq=False)
@@ -146,17 +144,19 @@ class _CommonCells:
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep]) -> _CommonCells:
         """Create empty cells, using the largest of the first three sweeps."""
-        reference = max(map(read, range(min(3, recording.count))), key=len)
+        reference = max(map(read, range(min(3, len(recording)))), key=len)
         if not len(reference):
-            raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
+            raise LidarError(
+                f"{recording.info.name} contains no points, so there is nothing to fit."
+            )
         # This call determines the rings. It stays outside `prefix_errors`, because errors that
         # occur when a sweep is read already name the recording.
         ring_notes = rings_note(recording, reference)
-        with prefix_errors(recording.name):
+        with prefix_errors(recording.info.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
         shape = len(images.rings), round(360 / images.step_deg)
         max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)
-        numbers = even_indices(recording.count, max_sweeps)
+        numbers = even_indices(len(recording), max_sweeps)
         values = np.full((4, len(numbers), *shape), np.nan, np.float32)
         elevation_deg = images.elevation_deg
         return cls(numbers, reference, ring_notes, images, images.rings, elevation_deg, values)

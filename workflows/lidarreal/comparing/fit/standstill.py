@@ -46,7 +46,7 @@ def read_static(recording: Recording, *, is_stationary: bool = False) -> SweepSt
     stack = SweepStack.read(recording)
     if stack.sweep_count < 2:
         return stack
-    name = recording.name
+    name = recording.info.name
     speed = None if is_stationary else find_motion(stack, sweep_period_ns(recording, stack.numbers))
     if speed is not None:
         raise LidarError(

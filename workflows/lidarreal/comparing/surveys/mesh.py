@@ -41,7 +41,7 @@ def mesh_deviations(
     mesh: Path,
     max_distance_m: float,
     frame: StatedFrame | None = None,
-    world_origin: Floats | None = None,
+    world_origin: tuple[float, float, float] | None = None,
     show: WritingProgress = lambda *_: None,
     **options: Any,
 ) -> Deviations:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarfiles.clouds.recording import Recording
+from lidarfiles.clouds.recording import PointCloud, Recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.motion.straight_lines import StraightLines
@@ -192,11 +192,11 @@ def _sourced_parts(clouds: Sequence[SurveyCloud]) -> Iterator[tuple[int, Sweep, 
             yield file, part, sources
 
 
-def _line_starts_ns(recording: Recording) -> Floats:
+def _line_starts_ns(recording: Recording | PointCloud) -> Floats:
     """Return the times at which the flight lines of a recording start, in nanoseconds."""
-    if recording.is_cloud or recording.stamps_ns is None or recording.count < 2:
+    if isinstance(recording, PointCloud) or recording.stamps_ns is None or len(recording) < 2:
         return np.zeros(0)
-    poses = recording.poses(range(recording.count))
+    poses = recording.poses(range(len(recording)))
     if poses is None:
         return np.zeros(0)
     first = recording[0].time_ns

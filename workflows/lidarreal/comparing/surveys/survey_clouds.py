@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
-from lidarfiles.clouds.recording import Recording, SeveralSensorsError
+from lidarfiles.clouds.recording import PointCloud, Recording
+from lidarfiles.clouds.recording_ref import SeveralSensorsError
 from lidarfiles.parts.parts import StoredCloud
 from lidarfiles.recordings.opening import open_recording
 from lidarsim.columns.cloud import Cloud
@@ -66,7 +67,7 @@ class SurveyCloud:
     """A cloud in world coordinates, or the sweeps of all sensors of a survey."""
 
     name: str
-    recordings: tuple[Recording, ...]  # one per sensor
+    recordings: tuple[Recording | PointCloud, ...]  # one per sensor
     unit: str | None  # unit that the user chose
     show: WritingProgress = lambda *_: None  # called when a part has been read
     shift_m: Floats | None = None  # (3,): world origin that is added to all points, if any
@@ -90,16 +91,16 @@ class SurveyCloud:
         and none is chosen.
         """
 
-        def opened(chosen: str | None) -> Recording:
+        def opened(chosen: str | None) -> Recording | PointCloud:
             return open_recording(source, chosen, name=name, unit=unit, keep_noise=keep_noise)
 
         try:
             recordings = [opened(sensor)]
         except SeveralSensorsError as error:
             recordings = [opened(chosen) for chosen in error.names]
-            if len({recording.sequence for recording in recordings}) > 1:
+            if len({recording.info.sequence for recording in recordings}) > 1:
                 raise
-        return cls(recordings[0].name, tuple(recordings), unit, show)
+        return cls(recordings[0].info.name, tuple(recordings), unit, show)
 
     @property
     def notes(self) -> list[str]:
@@ -115,7 +116,7 @@ class SurveyCloud:
     @property
     def point_count(self) -> int | None:
         """Number of points, or None if it is not known before the points are read."""
-        counts = [recording.point_count for recording in self.recordings]
+        counts = [recording.info.point_count for recording in self.recordings]
         return None if None in counts else sum(filter(None, counts))
 
     @cached_property
@@ -124,14 +125,14 @@ class SurveyCloud:
         return StatedFrame.from_recording(self.recordings[0], self.name)
 
     @property
-    def world_origin(self) -> Floats | None:
-        """World origin that is contained in the points, or None."""
-        return self.recordings[0].world_origin
+    def world_origin(self) -> tuple[float, float, float] | None:
+        """World origin in meters that is contained in the points, or None."""
+        return self.recordings[0].info.world_origin
 
     @property
     def unit_name(self) -> str:
         """Name of the length unit of the file."""
-        meters = self.recordings[0].meters[0]
+        meters = self.recordings[0].info.meters[0]
         names = (name for name, unit_m in UNITS_M.items() if abs(unit_m / meters - 1) < _MILLIONTH)
         return next(names, f"units of {meters:.10g} m")
 
@@ -143,11 +144,11 @@ class SurveyCloud:
 
         Raises LidarError if the cloud cannot be read, or if a pose is unknown.
         """
-        total = sum(recording.count for recording in self.recordings)
-        unit = "parts" if self.recordings[0].is_cloud else "sweeps"
+        total = sum(len(recording) for recording in self.recordings)
+        unit = "parts" if isinstance(self.recordings[0], PointCloud) else "sweeps"
         done = 0
         for number, sweeps in enumerate(self._sweeps):
-            for index in range(sweeps.recording.count):
+            for index in range(len(sweeps.recording)):
                 done += 1
                 self.show(f"reading {self.name}", done, total, unit)
                 part = _world_points(sweeps, index, with_ranges=with_ranges)
@@ -196,25 +197,24 @@ class SurveyCloud:
 def _world_points(sweeps: PosedSweeps, number: int, *, with_ranges: bool) -> Sweep:
     """Return the returns of a sweep in world coordinates, with the position of its scanner."""
     recording = sweeps.recording
-    if recording.is_cloud:
-        sweep = recording[number].returns()
-    else:
-        # Points as fired are at their ranges from the sensor. They are read only if required,
-        # because they are transformed with a pose each.
-        sweep = sweeps.read(number, as_fired=with_ranges)
+    info = recording.info
+    # Points as fired are at their ranges from the sensor. They are read only if required, because
+    # they are transformed with a pose each.
+    sweep = sweeps.read(number, as_fired=with_ranges)
     check_reach(recording, sweep)
     scanner = sweep.scanner
     if scanner is not None:
-        scanner = np.asarray(scanner, np.float64) * recording.meters
-    if recording.is_cloud:
+        scanner = np.asarray(scanner, np.float64) * info.meters
+    if isinstance(recording, PointCloud):
         return sweep.replace(scanner=scanner)
     if sweep.pose is None:
         raise LidarError(
-            f"{recording.name} is in sensor coordinates and does not contain the pose of the "
-            "sensor, so its points cannot be compared in world coordinates."
+            f"{info.name} is in sensor coordinates and does not contain the pose of the sensor, so "
+            "its points cannot be compared in world coordinates."
         )
     # Files of scans without a pose are read with an identity matrix.
-    if scanner is None and (recording.read_poses or not np.array_equal(sweep.pose, np.eye(4))):
+    is_known = recording.has_stored_poses or not np.array_equal(sweep.pose, np.eye(4))
+    if scanner is None and is_known:
         scanner = sweep.pose[:3, 3]
     columns = sweep.columns
     if with_ranges and "range" not in columns:
