@@ -21,22 +21,23 @@ BEHIND_M = np.array([15.0, 12.0, 2.0])
 AHEAD_M = np.array([20.0, 9.0, 3.5])
 
 
-def directions():
-    azimuth = np.radians(np.arange(COLUMNS) * 360 / COLUMNS + 0.1)[None, :]
+def directions(azimuth_deg=0.0):
+    azimuth = np.radians(np.arange(COLUMNS) * 360 / COLUMNS + 0.1 + azimuth_deg)[None, :]
     elevation = np.radians(np.linspace(-15, 15, RINGS))[:, None]
     level = np.cos(elevation)
     x, y = level * np.cos(azimuth), level * np.sin(azimuth)
     return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).reshape(-1, 3)
 
 
-def room(position=(0, 0, 0), yaw_rad=0.0, longer_m=0.0):
+def room(position=(0, 0, 0), yaw_rad=0.0, longer_m=0.0, azimuth_deg=0.0):
     """Return a sweep in a room, at a position and with a yaw in the frame of the first sweep."""
     turn = np.array([[np.cos(yaw_rad), -np.sin(yaw_rad), 0],
                      [np.sin(yaw_rad), np.cos(yaw_rad), 0], [0, 0, 1]])  # fmt: skip
-    rays = directions() @ turn.T
+    fired = directions(azimuth_deg)
+    rays = fired @ turn.T
     walls_m = np.where(rays > 0, AHEAD_M - position, BEHIND_M + position)
     range_m = (walls_m / np.abs(rays).clip(min=1e-12)).min(axis=1) + longer_m
-    return Sweep(directions() * range_m[:, None], {"channel": np.arange(RINGS).repeat(COLUMNS)})
+    return Sweep(fired * range_m[:, None], {"channel": np.arange(RINGS).repeat(COLUMNS)})
 
 
 def stack_of(*sweeps):
@@ -54,6 +55,16 @@ def test_range_changes_show_the_motion_of_the_sensor(shift, yaw_rad):
     assert motion.yaw_rad == pytest.approx(yaw_rad, abs=0.001)
     still = RangeChanges.between(stack_of(room(), room()), 0, 1)
     assert still.motion() is None
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.3, -0.2])
+def test_range_changes_do_not_depend_on_the_azimuths_of_the_pulses(azimuth_deg):
+    stack = stack_of(room(), room(azimuth_deg=azimuth_deg))
+    changes = RangeChanges.between(stack, 0, 1)
+    raw_m = np.abs(stack.ranges[1] - stack.ranges[0])[changes.chosen]
+    assert np.quantile(raw_m, 0.9) > 0.03
+    assert np.quantile(np.abs(changes.change[changes.chosen]), 0.9) < 0.003
+    assert changes.motion() is None
 
 
 def test_bends_of_surfaces_and_errors_of_normals_are_noise_of_range_changes():

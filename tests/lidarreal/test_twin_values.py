@@ -451,6 +451,17 @@ def test_surfels_of_a_plane_close_the_gap_between_rings(range_m, incidence_deg, 
     np.testing.assert_allclose(across_m[inner], half_m, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("range_m", "half_m"), [(5.0, 0.3), (40.0, 0.4), (90.0, 0.46)])
+def test_surfels_of_sparse_points_are_limited_by_voxels_or_the_gap_between_rings(range_m, half_m):
+    """The points are 0.5 m apart, and voxels 0.1 m large."""
+    points = np.floor(lattice(20, 20, 0.5) / 0.1) * 0.1 + 0.05
+    outward = np.tile([range_m, 0, 0], (400, 1))
+    surfels = Surfels.from_points("plane", points, outward, 0.1, 0.01)
+    inner = (np.abs(surfels.centers[:, 1:] - 5) < 3).all(axis=1)
+    along_m = np.linalg.norm(surfels.half_sides[0], axis=1)[inner]
+    np.testing.assert_allclose(along_m, half_m, rtol=0.03)
+
+
 @pytest.mark.parametrize(("range_m", "is_pole"), [(5.0, True), (20.0, True), (50.0, False)])
 @pytest.mark.parametrize("is_upright", [True, False])
 def test_lines_across_several_rings_are_poles_that_face_the_sensor(range_m, is_pole, is_upright):
@@ -462,6 +473,17 @@ def test_lines_across_several_rings_are_poles_that_face_the_sensor(range_m, is_p
     is_thin = np.isclose(half_m, 0.05)  # half a voxel
     assert (is_thin == (is_pole and is_upright)).all()
     np.testing.assert_allclose(surfels.normals[is_thin] @ [0.6, -0.8, 0], 1)
+
+
+@pytest.mark.parametrize(("range_m", "is_pole"), [(20.0, True), (30.0, False)])
+def test_poles_below_the_sensor_appear_shorter(range_m, is_pole):
+    """The neighbors have a standard deviation of 0.35 m, of which 80 % are across the beams."""
+    outward = np.tile([0, -0.8 * range_m, 0.6 * range_m], (100, 1))
+    surfels = Surfels.from_points("pole", lattice(1, 100), outward, 0.1, 0.01)
+    inner = np.abs(surfels.centers[:, 2] - 5) < 4
+    is_thin = np.isclose(np.linalg.norm(surfels.half_sides[1], axis=1), 0.05)
+    assert (is_thin[inner] == is_pole).all()
+    np.testing.assert_allclose(surfels.normals[is_thin] @ [0, -1.0, 0], 1)
 
 
 def test_surfels_of_lost_pulses_face_the_sensor():

@@ -72,6 +72,15 @@ def test_rays_that_were_recorded_return_the_simulated_sweep(dense):
     assert augmented.sweep.columns["channel"].dtype == np.uint16
 
 
+def test_rays_on_recorded_rings_find_their_pulses(dense):
+    """The elevations of the returns are rounded differently."""
+    for elevation_deg in (-14.0, -3.0, 4.0):
+        sensor = Sensor.grid(240, 1, vertical_fov_deg=0)
+        beams = replace(sensor.beams, elevation=np.radians([elevation_deg]))
+        augmented = SensorResampler(recording(dense), replace(sensor, beams=beams)).sweep(0)
+        assert len(augmented.sweep) == 240
+
+
 def test_closest_pulses_are_at_most_half_of_the_recorded_spacing_away(dense):
     other = load_sensor("velodyne/vlp16", rate_hz=20)  # 0.4 degrees
     dense = scan_room(Sensor.grid(1440, 47, vertical_fov_deg=32))
@@ -171,6 +180,23 @@ def test_equal_resolution_uses_each_return_once(dense):
     augmented = SensorResampler(recording(shaken), DENSE).sweep(0)
     assert len(np.unique(augmented.template)) == len(augmented.template)
     assert len(augmented.sweep) > 0.95 * len(dense)
+
+
+@pytest.mark.parametrize("is_swapped", [False, True])
+def test_the_ray_with_the_smaller_angle_receives_a_shared_pulse(dense, is_swapped):
+    """Two channels are above and below a ring. Both differences add up to the angle."""
+    sensor = Sensor.grid(240, 32, vertical_fov_deg=31)
+    azimuth_deg = np.zeros(32)
+    azimuth_deg[[7, 8]] = 0.05, 0.1
+    elevation_deg = np.concatenate([np.arange(-15, -8), [-8.25, -7.77], np.arange(-7, 16)])
+    order = np.arange(32)
+    if is_swapped:
+        order[[7, 8]] = 8, 7
+    azimuth, elevation = np.radians(azimuth_deg)[order], np.radians(elevation_deg)[order]
+    beams = replace(sensor.beams, azimuth=azimuth, elevation=elevation)
+    augmented = SensorResampler(recording(dense), replace(sensor, beams=beams)).sweep(0)
+    counts = np.bincount(augmented.sweep.columns["channel"], minlength=32)
+    assert counts[order].tolist() == [240] * 7 + [0] + [240] * 24
 
 
 def test_tilted_rings_are_measured(dense):

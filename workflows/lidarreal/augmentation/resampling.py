@@ -378,7 +378,8 @@ def _half_spacings(rings: Floats, elevation: Floats) -> Floats:
     all rings, the spacing is that of the outermost rings.
     """
     above = rings - elevation[:, None]
-    to_above = np.where(above >= 0, above, np.inf).min(axis=1)
+    # The spacing at the elevation of a ring is that to the next ring above it.
+    to_above = np.where(above > 0, above, np.inf).min(axis=1)
     to_below = np.where(above <= 0, -above, np.inf).min(axis=1)
     half = np.maximum((to_above + to_below) / 2, np.minimum(to_above, to_below))
     half = np.where(np.isinf(to_above), np.abs(rings[:, 0] - rings[:, 1]) / 2, half)
