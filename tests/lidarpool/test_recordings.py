@@ -16,9 +16,13 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from tests.made_recordings import changed_recording
 
+from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.recordings.opening import open_recording
 from lidarpool.pages.opened import open_view
 from lidarreal import compare, twin
+from lidarreal.augmentation.effects import Effects
+from lidarreal.augmentation.running import Augmentation
+from lidarreal.augmentation.variants import Variants
 from lidarreal.comparing.fit.stack import SweepStack
 from lidarreal.reconstruction.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarreal.reconstruction.lost_pulses import SensorCoverage
@@ -357,18 +361,35 @@ def test_sweeps_of_bags_have_the_times_of_their_headers(tmp_path):
     sweeps = drive(relative)
     live = write_bag(tmp_path / "live", sweeps, late_ns=10**8)
     offline = write_bag(tmp_path / "offline", sweeps)
-    expected_ns = START_NS + 1e8 * np.arange(SWEEPS)
-    np.testing.assert_allclose(open_recording(live).stamps_ns, expected_ns, rtol=0, atol=512)
+    expected_ns = START_NS + 10**8 * np.arange(SWEEPS)
+    np.testing.assert_array_equal(open_recording(live).stamps_ns, expected_ns)
     found = compare(live, offline, match="time").figures
     assert found["pairs"] == SWEEPS
     assert found["ranges"]["residual"]["rmse_m"] < 1e-6
 
 
+def test_stamps_are_exact_to_the_nanosecond(tmp_path):
+    """In double precision, nanoseconds since 1970 are multiples of 256."""
+    expected_ns = [START_NS + 123_456_789 + 100_000_001 * number for number in range(SWEEPS)]
+    sweeps = [
+        (stamp_ns, columns)
+        for stamp_ns, (_, columns) in zip(expected_ns, drive(relative), strict=True)
+    ]
+    recording = open_recording(write_bag(tmp_path / "bag", sweeps))
+    assert recording.stamps_ns.dtype == np.int64 and recording.stamps_ns.tolist() == expected_ns
+    assert [sweep.time_ns for sweep in recording] == expected_ns
+    ref = RecordingRef(tmp_path / "bag")
+    clear = Augmentation(ref, Variants(Effects()), output_format="mcap", reflectance=0.3)
+    clear.run(tmp_path / "copies", workers=1)
+    (copy,) = (tmp_path / "copies").glob("*.mcap")
+    assert open_recording(copy).stamps_ns.tolist() == expected_ns
+
+
 def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
     unstamped = [(0, columns) for _, columns in drive(relative)]
     recording = open_recording(write_bag(tmp_path / "bag", unstamped, late_ns=10**8))
-    expected_ns = START_NS + 1e8 * np.arange(1, SWEEPS + 1)
-    np.testing.assert_allclose(recording.stamps_ns, expected_ns, rtol=0, atol=512)
+    expected_ns = START_NS + 10**8 * np.arange(1, SWEEPS + 1)
+    np.testing.assert_array_equal(recording.stamps_ns, expected_ns)
     assert recording.notes[0].endswith(
         "bag has no timestamps, so the recording times are used instead"
     )

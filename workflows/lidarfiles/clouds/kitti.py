@@ -7,10 +7,11 @@ from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
@@ -27,7 +28,7 @@ from lidarsim.io.numbered_files import (
 )
 from lidarsim.io.time_units import seconds_of
 from lidarsim.motion.rotations import matrices
-from lidarsim.numerics.arrays import Floats, Floats32
+from lidarsim.numerics.arrays import Floats, Floats32, Ints
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
@@ -62,6 +63,9 @@ _FILE_PATTERN = (
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt)|"
     r"flow/\d+/pc[12]\.npy)"
 )
+
+
+Row = TypeVar("Row", bound=np.generic)
 
 
 class KITTI(MultiFileFormat):
@@ -401,7 +405,7 @@ class _KittiRecording(FileRecording):
         labels: Path,
         folder: Path | None = None,
         poses: Floats | None = None,
-        times_ns: Floats | None = None,
+        times_ns: Ints | None = None,
     ) -> None:
         super().__init__(info, files)
         self._labels = labels
@@ -412,10 +416,10 @@ class _KittiRecording(FileRecording):
     def load(self, number: int) -> Sweep:
         file = self.paths[number]
         pose = None if self._sweep_poses is None else self._sweep_poses[number]
-        time_ns = None if self._times_ns is None else self._times_ns[number]
+        time_ns = None if self._times_ns is None else int(self._times_ns[number])
         return _read_sweep(file, self._labels / f"{file.stem}.label", pose=pose, time_ns=time_ns)
 
-    def load_stamps(self) -> Floats | None:
+    def load_stamps(self) -> Ints | None:
         return self._times_ns
 
     def load_boxes(self) -> RecordedBoxes | None:
@@ -472,26 +476,26 @@ class _FrameTables:
                 return lidar_poses(rows, sequence / CALIBRATION_FILE)
         return None
 
-    def read_times_ns(self, sequence: Path, points: Path) -> Floats | None:
+    def read_times_ns(self, sequence: Path, points: Path) -> Ints | None:
         """Return the timestamps of the sweeps in nanoseconds, or None if there are none."""
         if (sequence / "times.txt").exists():
             seconds = np.loadtxt(sequence / "times.txt", ndmin=1)
             times_ns = 1e9 * seconds_of(
                 seconds, None, advice=("specify the times in times.txt in seconds")
             )
-            return self._of_files(times_ns, "times.txt")
+            return self._of_files(np.rint(times_ns).astype(np.int64), "times.txt")
         stamps = points.absolute().parent / _STAMP_FILE
         if stamps.parent.name != _RAW_FOLDER or not stamps.exists():
             return None
-        times_ns = self._of_files(_timestamps_ns(stamps), _STAMP_FILE)
-        if np.isnan(times_ns).any():
-            file = self.files[int(np.isnan(times_ns).argmax())]
+        times = self._of_files(_timestamps(stamps), _STAMP_FILE)
+        if np.isnat(times).any():
+            file = self.files[int(np.isnat(times).argmax())]
             raise ValueError(
                 f"{_STAMP_FILE} has no time for {file.name}. Add it, or remove the file"
             )
-        return times_ns
+        return times.astype(np.int64)
 
-    def _of_files(self, rows: Floats, table: str) -> Floats:
+    def _of_files(self, rows: NDArray[Row], table: str) -> NDArray[Row]:
         """Return the rows that belong to point files. If there are other rows, add a note."""
         indices = rows_of_frames(self.files, len(rows), table, "point files")
         if surplus := frames_without_file(self.files, len(rows)):
@@ -516,28 +520,26 @@ def _notes_on_tables(points: Path) -> list[str]:
     return []
 
 
-def _timestamps_ns(path: Path) -> Floats:
-    """Read the timestamps of a raw drive in nanoseconds since 1970.
+def _timestamps(path: Path) -> NDArray[np.datetime64]:
+    """Read the timestamps of a raw drive with a resolution of 1 ns.
 
     The file has a row for each frame, also for frames that were not recorded. Rows without a time
-    are NaN.
+    are NaT.
 
     Raises ValueError with the line number if a line is invalid.
     """
     lines = read_input_text(path).rstrip().splitlines()
-    times_ns = np.full(len(lines), np.nan)
+    times = np.full(len(lines), np.datetime64("NaT", "ns"))
     for row, line in enumerate(lines):
         if not line.strip():
             continue
         try:
-            stamp = np.datetime64(line.strip(), "ns")
+            times[row] = np.datetime64(line.strip(), "ns")
         except ValueError as error:
             raise ValueError(
                 f"{path.name}: line {row + 1} is not a time such as 2011-09-26 13:02:25.594360375"
             ) from error
-        if not np.isnat(stamp):
-            times_ns[row] = stamp.astype(np.int64)
-    return times_ns
+    return times
 
 
 def _class_names(sequence: Path) -> dict[int, str]:

@@ -615,8 +615,8 @@ class _NuScenesRecording(Recording):
     def load(self, number: int) -> Sweep:
         return self._tables.read(self._rows[number])
 
-    def load_stamps(self) -> Floats:
-        return 1e3 * np.array([row["timestamp"] for row in self._rows])
+    def load_stamps(self) -> list[int]:
+        return [1000 * row["timestamp"] for row in self._rows]
 
     def load_boxes(self) -> RecordedBoxes | None:
         return self._tables.boxes(self._rows)
@@ -778,7 +778,7 @@ class NuScenesTables:
                 raise ValueError(f"{label_file.name} has {len(labels)} labels for {count} points")
             columns["class"] = self.classes[labels]
         return sweep_from_columns(
-            columns, pose=self.sensor_pose(row), time_ns=1e3 * row["timestamp"]
+            columns, pose=self.sensor_pose(row), time_ns=1000 * row["timestamp"]
         )
 
 

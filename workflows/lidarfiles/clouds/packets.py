@@ -121,6 +121,6 @@ class _CaptureRecording(SequentialRecording):
         columns = dict(self._decoder.columns(self._sensor, stored))
         return sweep_from_columns(columns, time_ns=self._decoder.time_ns(stored))
 
-    def load_stamps(self) -> list[float]:
+    def load_stamps(self) -> list[int]:
         with self.lock:
             return [self._decoder.time_ns(sweep) for sweep in self.stored_sweeps()]

@@ -15,7 +15,7 @@ import numpy as np
 from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses
-from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from .recording import PointCloud, Recording
@@ -121,7 +121,7 @@ class PosedSweeps:
 
 
 def path_of_sweep(
-    pose_of: Callable[[int], Floats | None], stamps_ns: Floats, number: int
+    pose_of: Callable[[int], Floats | None], stamps_ns: Ints, number: int
 ) -> Track | None:
     """Return the trajectory of the sensor from the previous to the next sweep.
 

@@ -359,7 +359,7 @@ class Recording(PointSource):
         """
         raise NotImplementedError
 
-    def load_stamps(self) -> Iterable[float] | None:
+    def load_stamps(self) -> Sequence[int] | Ints | None:
         """Return the timestamps of all sweeps in nanoseconds, or None if they are unknown."""
         return None
 
@@ -459,14 +459,18 @@ class Recording(PointSource):
             return self.load_boxes()
 
     @cached_property
-    def stamps_ns(self) -> Floats | None:
-        """Timestamps of the sweeps in nanoseconds, or None if they are unknown.
+    def stamps_ns(self) -> Ints | None:
+        """Timestamps of the sweeps in whole nanoseconds, or None if they are unknown.
 
-        The shape is (n,), and the dtype is float64.
+        The shape is (n,), and the dtype is int64, because float64 cannot represent nanoseconds
+        since 1970.
         """
         with reading(self.info.name):
             stamps = self.load_stamps()
-            return None if stamps is None else np.fromiter(stamps, np.float64)
+            if stamps is None:
+                return None
+            values = np.asarray(stamps)
+            return np.asarray(np.rint(values) if values.dtype.kind == "f" else values, np.int64)
 
     @property
     def rings(self) -> Rings:
@@ -484,11 +488,10 @@ class Recording(PointSource):
         # Points are read as fired, because motion compensation changes their elevation angles.
         sweeps = {number: self.fired(number) for number in numbers}
         sweeps = {number: sweep for number, sweep in sweeps.items() if len(sweep)}
-        stamps_s = self.stamps_ns
-        if stamps_s is not None and len(stamps_s) == len(self):
-            stamps_s = 1e-9 * stamps_s[[*sweeps]]
-        else:
-            stamps_s = None
+        stamps_ns = self.stamps_ns
+        stamps_s = None
+        if stamps_ns is not None and len(stamps_ns) == len(self):
+            stamps_s = np.asarray(1e-9 * stamps_ns[[*sweeps]], np.float64)
         columns = [sweep.columns for sweep in sweeps.values()]
         times = PointTimes.from_sweeps(columns, stamps_s) if columns else None
         return Rings.from_sweeps(self.info.name, [*sweeps.values()]), times
@@ -552,7 +555,7 @@ class SweepsInMemory(Recording):
         info: RecordingInfo | str,
         sweeps: Sequence[Sweep],
         *,
-        stamps_ns: Floats | None = None,
+        stamps_ns: Ints | None = None,
         poses: Floats | None = None,
     ) -> None:
         super().__init__(RecordingInfo(info) if isinstance(info, str) else info)
@@ -567,7 +570,7 @@ class SweepsInMemory(Recording):
         """Return a sweep."""
         return self._sweeps[number]
 
-    def load_stamps(self) -> Floats | None:
+    def load_stamps(self) -> Ints | None:
         """Return the timestamps of all sweeps in nanoseconds."""
         return self._stamps_ns
 
@@ -628,7 +631,7 @@ class DerivedRecording(Recording):
         """Read a sweep of the source as fired."""
         return self.source.load_fired(number)
 
-    def load_stamps(self) -> Iterable[float] | None:
+    def load_stamps(self) -> Ints | None:
         """Return the timestamps of the source."""
         return self.source.stamps_ns
 
@@ -677,7 +680,7 @@ class RecordingSection(DerivedRecording):
         """Read a sweep of the section as fired."""
         return self.source.load_fired(self._rows.start + number)
 
-    def load_stamps(self) -> Floats | None:
+    def load_stamps(self) -> Ints | None:
         """Return the timestamps of the section."""
         stamps_ns = self.source.stamps_ns
         return None if stamps_ns is None else stamps_ns[self._rows]

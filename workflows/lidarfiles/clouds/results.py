@@ -11,7 +11,7 @@ import numpy as np
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Floats
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..identity.fingerprint import fingerprint
@@ -117,7 +117,7 @@ class _Result(Recording):
             saved.in_sensor(index, points.positions),
             points.columns,
             pose=saved.pose.matrix(index),
-            time_ns=float(saved.begins_ns[index]),
+            time_ns=round(saved.begins_ns[index]),
         )
 
     def load_fired(self, number: int) -> Sweep:
@@ -129,13 +129,14 @@ class _Result(Recording):
             saved.as_fired(index, points, poses),
             points.columns,
             pose=saved.pose.matrix(index),
-            time_ns=float(saved.begins_ns[index]),
+            time_ns=round(saved.begins_ns[index]),
             compensated=False,
             firing_poses=poses,
         )
 
-    def load_stamps(self) -> Floats:
-        return self._saved.begins_ns[self._indices] + (self._saved.start_ns or 0)
+    def load_stamps(self) -> Ints:
+        begins_ns = np.rint(self._saved.begins_ns[self._indices]).astype(np.int64)
+        return begins_ns + (self._saved.start_ns or 0)
 
     def load_poses(self) -> Floats:
         return np.array([self._saved.pose.matrix(index) for index in self._indices])

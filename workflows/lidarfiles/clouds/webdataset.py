@@ -237,7 +237,7 @@ class _Sample(NamedTuple):
 
     path: Path
     members: dict[str, tuple[int, int]]  # {extension: (offset, size)}
-    time_ns: float | None
+    time_ns: int | None
     compensated: bool | None  # whether the points are motion-compensated
 
     def read(self) -> Sweep:
@@ -264,7 +264,9 @@ def _samples_of_sensors(files: list[Path]) -> dict[str, list[_Sample]]:
                 continue
             description = json.loads(_slice(path, *members["json"])) if "json" in members else {}
             compensated = states_compensation(str(description.get("frame")))
-            sample = _Sample(path, members, description.get("time_ns"), compensated)
+            stated_ns = description.get("time_ns")
+            time_ns = None if stated_ns is None else round(stated_ns)
+            sample = _Sample(path, members, time_ns, compensated)
             samples_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
     if not samples_of_sensor:
         raise LidarError(
@@ -287,7 +289,7 @@ class _WebRecording(Recording):
     def load(self, number: int) -> Sweep:
         return self._samples[number].read()
 
-    def load_stamps(self) -> list[float] | None:
+    def load_stamps(self) -> list[int] | None:
         times_ns = [sample.time_ns for sample in self._samples if sample.time_ns is not None]
         return times_ns if len(times_ns) == len(self) else None
 

@@ -29,7 +29,7 @@ _SAMPLE_POINTS = 200_000
 _GROWING_POINTS = 1_000_000
 # Callback for a part of a cloud and the fraction of the cloud that has been read.
 OnPart = Callable[[Sweep, float], None]
-_SWEEP_NS = 1e8  # assumed time between sweeps if the recording has no times
+_SWEEP_NS = 100_000_000  # assumed time between sweeps if the recording has no times
 _GRAY = 188  # byte of an unknown color, which is 50 % of the light
 # Class names of ASPRS LAS 1.4, indexed by class number.
 ASPRS_CLASSES = (
@@ -258,7 +258,7 @@ def _read_cloud(recording: PointCloud, on_part: OnPart) -> Cloud:
 class _TimedSweep:
     """Time, sensor and number of a sweep that has not been read yet."""
 
-    begins_ns: float
+    begins_ns: int
     sensor: int
     number: int
 
@@ -269,15 +269,15 @@ def _sort_sweeps(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]
     is_timed = True
     for sensor, recording in enumerate(sensors):
         stamps_ns = recording.stamps_ns
-        times = _SWEEP_NS * np.arange(len(recording), dtype=np.float64)
+        times = _SWEEP_NS * np.arange(len(recording), dtype=np.int64)
         if stamps_ns is None or len(stamps_ns) < len(recording):
             is_timed = False
         else:
             times = stamps_ns
         sweeps += [
-            _TimedSweep(float(times[number]), sensor, number) for number in range(len(recording))
+            _TimedSweep(int(times[number]), sensor, number) for number in range(len(recording))
         ]
-    start_ns = min((sweep.begins_ns for sweep in sweeps), default=0.0)
+    start_ns = min((sweep.begins_ns for sweep in sweeps), default=0)
     ordered = sorted(sweeps, key=lambda sweep: (sweep.begins_ns, sweep.sensor))
     return [
         _TimedSweep(sweep.begins_ns - start_ns, sweep.sensor, sweep.number) for sweep in ordered
@@ -329,7 +329,7 @@ def recorded_sweeps(
     known = [np.eye(4) if pose is None else pose for pose in poses]
     matrices = np.array(known, np.float64).reshape(-1, 4, 4)
     count = len(ordered)
-    begins_ns = np.array([sweep.begins_ns for sweep in ordered])
+    begins_ns = np.array([sweep.begins_ns for sweep in ordered], np.float64)
     still = SweepPoses(np.zeros((len(names), 3)), np.tile([0.0, 0, 0, 1], (len(names), 1)))
     return Sweeps(
         scans=np.arange(count + 1),

@@ -244,7 +244,7 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
     return pairs
 
 
-def _sweep_times(recording: Recording) -> Floats:
+def _sweep_times(recording: Recording) -> Ints:
     if recording.stamps_ns is None:
         raise LidarError(f"{recording.info.name} has no sweep times. Omit `--match time`.")
     return recording.stamps_ns

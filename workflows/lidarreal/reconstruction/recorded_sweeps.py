@@ -397,7 +397,7 @@ def _stamps_s(recording: Recording) -> Floats | None:
     """Return the timestamps of all sweeps in seconds, or None if the recording has none."""
     if recording.stamps_ns is None:
         return None
-    stamps_s = 1e-9 * recording.stamps_ns
+    stamps_s = np.asarray(1e-9 * recording.stamps_ns, np.float64)
     if len(stamps_s) != len(recording):
         raise LidarError(
             f"{recording.info.name} has {plural(len(recording), 'sweep')}, but only "

@@ -92,8 +92,8 @@ class Sweep:
         Transformation from the sensor frame to the world frame, with shape (4, 4), or None if it is
         unknown. A function is called when the pose is requested.
     time_ns
-        Timestamp of the sweep in nanoseconds, or None if it is unknown. For results, this is the
-        time since the start of the survey.
+        Timestamp of the sweep in whole nanoseconds, or None if it is unknown. For results, this is
+        the time since the start of the survey.
     compensated
         Whether the points are compensated for motion during the sweep, or None if unknown.
     firing_poses
@@ -130,7 +130,7 @@ class Sweep:
         columns: Columns | None = None,
         *,
         pose: Floats | Callable[[], Floats | None] | None = None,
-        time_ns: int | float | None = None,
+        time_ns: int | None = None,
         compensated: bool | None = None,
         firing_poses: SensorPoses | None = None,
         scanner: Floats | None = None,

@@ -232,7 +232,7 @@ class PacketDecoder(ABC):
         """Return the point columns of a sweep, which include x, y and z in meters."""
 
     @abstractmethod
-    def time_ns(self, sweep: Any) -> float:
+    def time_ns(self, sweep: Any) -> int:
         """Return the start time of a sweep in nanoseconds."""
 
 

@@ -549,10 +549,10 @@ class OusterDecoder(PacketDecoder):
             columns[field_name.lower()] = sweep.field(field_name)[ring, column]
         return columns
 
-    def time_ns(self, sweep: Any) -> float:
+    def time_ns(self, sweep: Any) -> int:
         """Return the time of the first column."""
         stamps = sweep.timestamp[sweep.timestamp > 0]
-        return float(stamps.min()) if len(stamps) else 0.0
+        return int(stamps.min()) if len(stamps) else 0
 
     def _readable_file(self, path: Path, metadata: Path) -> Path:
         """Return the file itself, or a temporary copy in a format that ouster-sdk reads."""

@@ -186,9 +186,9 @@ class VelodyneDecoder(PacketDecoder):
         """Return the fields of the points."""
         return {name: sweep.points[name] for name in sweep.points.dtype.names or ()}
 
-    def time_ns(self, sweep: _Sweep) -> float:
+    def time_ns(self, sweep: _Sweep) -> int:
         """Return the time at which the receiver got the first packet of the sweep."""
-        return float(1e9 * sweep.stamp.host)
+        return round(1e9 * sweep.stamp.host)
 
     def _captured(self) -> Iterator[CapturedDatagram]:
         """Yield the data packets of all sensors in the order of the file."""

@@ -357,7 +357,7 @@ class _BagRecording(SequentialRecording):
         stamp_ns = header_of(data).stamp_ns if self._is_stamped else recorded_ns
         is_livox = self._connection.msgtype in LIVOX_CLOUDS
         columns = livox_columns(data) if is_livox else point_columns(data)
-        return sweep_from_columns(columns, time_ns=float(stamp_ns))
+        return sweep_from_columns(columns, time_ns=stamp_ns)
 
     def _headers(self) -> list[MessageHeader]:
         with self.lock:
@@ -369,8 +369,8 @@ class _BagRecording(SequentialRecording):
                 )
             return headers
 
-    def load_stamps(self) -> list[float]:
-        return [float(header.stamp_ns) for header in self._headers()]
+    def load_stamps(self) -> list[int]:
+        return [header.stamp_ns for header in self._headers()]
 
     def load_poses(self) -> Floats | None:
         poses, clauses = _sweep_poses(self._path, self._headers())
