@@ -506,6 +506,20 @@ def test_m3c2_finds_a_shift_and_what_is_above_the_level_of_detection():
     assert level["significant"] < 0.12 * level["core_points"]
 
 
+def test_m3c2_omits_core_points_without_a_plane():
+    """py4dgeo does not set the normals of points with less than two neighbors."""
+    rng = np.random.default_rng(1)
+    b = plane(noise=0.01)
+    alone = rng.uniform(20, 90, (40, 3))
+    b = np.concatenate([b, alone, alone[:5] + 0.1])
+    a = b + np.array([0, 0, 0.01])
+    found = compare_surveys(cloud(a), cloud(b), method="m3c2", radius_m=0.8)
+    assert len(alone) <= found.figures["without_plane"] <= len(alone) + 5
+    assert components(found, "distance")["mean_m"] == pytest.approx(0.01, abs=0.003)
+    with pytest.raises(LidarError, match="two neighbors"):
+        compare_surveys(cloud(b), cloud(alone), method="m3c2", radius_m=0.8)
+
+
 # -- meshes ---------------------------------------------------------------------------------------
 
 
