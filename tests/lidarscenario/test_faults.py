@@ -256,7 +256,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     frozen = Sweeps.from_survey(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
     assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
-    assert sweep_of_job(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
+    assert sweep_of_job(job, again, 2, (None, {}), None, compensated=True).faults[0].by_s == -0.5
     output = WebDataset(cloud, sweeps)
     told = [
         b"".join(output.sample_files(k, points, None))
