@@ -184,7 +184,9 @@ def start_and_hang(path):
     time.sleep(3600)
 
 
-@pytest.mark.parametrize("block", [start_and_hang, stop_worker])
+@pytest.mark.parametrize(
+    "block", [start_and_hang, pytest.param(stop_worker, marks=pytest.mark.extended)]
+)
 def test_a_worker_is_freed_if_the_client_of_a_hung_task_leaves(
     nannies, wait_until, monkeypatch, tmp_path, block
 ):
