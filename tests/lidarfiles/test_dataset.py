@@ -18,7 +18,7 @@ import pytest
 from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 from lidarfiles.clouds.boxes import Boxes
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarfiles.datasets.job_table import JobRow

@@ -15,8 +15,9 @@ from tests.packet_surveys import points_of as cast_points
 from tests.packet_surveys import posts_before_walls
 
 from lidarfiles import PointCloud, Recording, RecordingInfo, SweepsInMemory, open_recording
+from lidarfiles.clouds.built_in_formats import FORMATS
 from lidarfiles.clouds.cloud_format import CloudFormat
-from lidarfiles.clouds.format_table import FORMATS, load_format
+from lidarfiles.clouds.format_table import load_format
 from lidarfiles.clouds.recorded_boxes import RecordedBoxes
 from lidarfiles.clouds.recording import LastRead, RayTimes, RecordingSection
 from lidarfiles.clouds.recording_ref import RecordingRef

@@ -17,7 +17,7 @@ from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 import lidarpool
 from lidarfiles import read_cloud
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table

@@ -11,7 +11,7 @@ import pytest
 from click.shell_completion import CompletionItem, ShellComplete
 from tests.plugin_files import write_distribution
 
-from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS
+from lidarfiles.clouds.built_in_formats import EXPORTS, LAYOUTS
 from lidarlive.playback.bridge_table import BRIDGES
 from lidarpool.cli.commands import cli
 from lidarsim.columns.table import OPTIONAL, TABLE

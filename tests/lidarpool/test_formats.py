@@ -31,7 +31,7 @@ from rosbags.typesys import Stores, get_typestore
 from lidarfiles import read_cloud, save_cloud
 from lidarfiles.clouds import multi_file_format, parquet, well_known_text
 from lidarfiles.clouds.boxes import Boxes
-from lidarfiles.clouds.format_table import EXPORTS, FORMATS
+from lidarfiles.clouds.built_in_formats import EXPORTS, FORMATS
 from lidarfiles.clouds.ros.layouts import LAYOUTS
 from lidarfiles.clouds.well_known_text import wkt
 from lidarfiles.clouds.writing import ExportSpec

@@ -10,7 +10,8 @@ import pytest
 import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarfiles.clouds.format_table import FORMATS, load_format
+from lidarfiles.clouds.built_in_formats import FORMATS
+from lidarfiles.clouds.format_table import load_format
 from lidarfiles.clouds.writing import ExportSpec
 from lidarpool.pages.preview import first_sweeps
 from lidarscenario.advice import advice

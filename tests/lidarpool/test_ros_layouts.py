@@ -19,7 +19,7 @@ from tests.drives import points_of, the_scene, the_survey
 from tests.shapes import room
 
 from lidarfiles import save_cloud
-from lidarfiles.clouds.format_table import LAYOUTS
+from lidarfiles.clouds.built_in_formats import LAYOUTS
 from lidarfiles.clouds.ros import layouts
 from lidarfiles.clouds.ros.bags import header_of
 from lidarfiles.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG

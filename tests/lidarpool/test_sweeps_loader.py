@@ -23,7 +23,8 @@ from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps,
 
 import lidarpool
 from lidarfiles.clouds.boxes import Boxes
-from lidarfiles.clouds.format_table import DATA_SETS, LAYOUTS, load_format
+from lidarfiles.clouds.built_in_formats import DATA_SETS, LAYOUTS
+from lidarfiles.clouds.format_table import load_format
 from lidarfiles.datasets.dataset import INDEX_FILE, DataSet
 from lidarfiles.datasets.job_table import JobRow, write_table
 from lidarfiles.recordings.opening import open_recording

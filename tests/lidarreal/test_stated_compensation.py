@@ -13,7 +13,7 @@ from tests.simulated_drives import simulated_drive
 
 import lidarfiles
 from lidarfiles import PointCloud, open_recording, save_cloud
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.clouds.posed_sweeps import PosedSweeps
 from lidarfiles.clouds.recording_ref import RecordingRef
 from lidarfiles.clouds.writing import ExportSpec

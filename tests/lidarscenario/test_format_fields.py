@@ -24,7 +24,8 @@ from pypcd4.pypcd4 import PointCloud
 from tests.shapes import level, room
 
 from lidarfiles import read_cloud, save_cloud
-from lidarfiles.clouds.format_table import FORMATS, load_format
+from lidarfiles.clouds.built_in_formats import FORMATS
+from lidarfiles.clouds.format_table import load_format
 from lidarfiles.clouds.ros.layouts import LAYOUTS
 from lidarfiles.clouds.writing import ExportSpec, with_format_columns
 from lidarscenario.prepare import prepare

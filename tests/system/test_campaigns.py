@@ -22,7 +22,7 @@ from tests.killed_drivers import drive
 
 import lidarpool.run.cluster.cluster
 import lidarpool.run.writer
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.datasets.dataset import DataSet
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.identity.sealed import seal_json, unseal_json

@@ -42,7 +42,8 @@ import lidarsim
 import lidarsim.packets
 import poolpart
 import raybeam
-from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
+from lidarfiles.clouds.built_in_formats import EXPORTS, LAYOUTS
+from lidarfiles.clouds.format_table import point_suffixes
 from lidarfiles.datasets.dataset import DATA_SETS
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.cli.commands import cli

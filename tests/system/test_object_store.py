@@ -20,7 +20,7 @@ from tests.system.test_resume import SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.datasets.dataset import job_file
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.parts.parts import unpack

@@ -16,7 +16,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 
-from lidarfiles.clouds.format_table import DATA_SETS
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.datasets.job_seconds import read_seconds
 from lidarfiles.identity.sealed import seal_json, unseal_json
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps

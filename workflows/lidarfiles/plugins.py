@@ -8,6 +8,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
 from .clouds.cloud_format import CloudFormat
+from .clouds.format_options import FormatOptions
 from .clouds.format_row import FormatRow
 from .clouds.multi_file_format import MultiFileFormat
 from .clouds.point_field import PointField
@@ -19,14 +20,13 @@ from .clouds.recording import (
     SweepsInMemory,
 )
 from .clouds.recording_ref import RecordingRef
-from .clouds.writing import ExportSpec
 
 __all__ = [
     "Cloud",
     "CloudFormat",
     "CloudLike",
-    "ExportSpec",
     "FileRecording",
+    "FormatOptions",
     "FormatRow",
     "MultiFileFormat",
     "PointCloud",

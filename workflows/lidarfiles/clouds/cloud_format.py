@@ -5,26 +5,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
-from lidarsim.numerics.arrays import AnyArray, Floats32
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..picture_file import PictureContent
+from .format_options import FormatOptions
 from .format_row import FormatRow
+from .job_reader import Entry, JobReader, PointColumns
 from .point_field import PointField
 from .recording import PointCloud, Recording
 from .recording_ref import RecordingRef
-
-if TYPE_CHECKING:
-    from .job_reader import JobReader
-    from .writing import ExportSpec
 
 # Frame in which a format stores points:
 # - cloud: same frame as the cloud
@@ -33,19 +29,6 @@ if TYPE_CHECKING:
 # - firing: sensor frame at the firing of each point, or like sweep with the option `compensated`
 # - none: the format stores measurements such as ranges instead of positions
 Frame = Literal["cloud", "world", "sweep", "firing", "none"]
-# Points in the sensor frame in meters, with shape (n, 3), and the columns that the format stores,
-# as {column: array with shape (n,)}.
-PointColumns = tuple[Floats32, dict[str, AnyArray]]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A job in a data set, whose number and name identify its files."""
-
-    number: int
-    name: str
-    split: str = ""
-    values: Mapping[str, Any] = field(default_factory=dict)  # varied values by name
 
 
 class CloudFormat(ABC):
@@ -75,7 +58,7 @@ class CloudFormat(ABC):
     # Columns that a cloud must have in addition to those of required fields. If `by_sweep` is true,
     # `scan` is required, too.
     required: ClassVar[tuple[str, ...]] = ()
-    options: ClassVar[tuple[str, ...]] = ()  # supported options of `ExportSpec`
+    options: ClassVar[tuple[str, ...]] = ()  # supported options of `FormatOptions`
     actor_boxes: ClassVar[bool] = False  # whether bounding boxes of actors are stored
     for_scenes: ClassVar[bool] = False  # whether scenes can be created from files of the format
     file_pattern: ClassVar[str] = ""  # regular expression for the files in the format's folder
@@ -92,7 +75,7 @@ class CloudFormat(ABC):
         self.entry = entry
 
     @abstractmethod
-    def write(self, path: Path, spec: ExportSpec) -> float | None:
+    def write(self, path: Path, spec: FormatOptions) -> float | None:
         """Write the cloud to a new file or folder.
 
         Returns
@@ -110,23 +93,23 @@ class CloudFormat(ABC):
 
     @classmethod
     def supports(cls, option: str) -> bool:
-        """Return whether the format supports an option of `ExportSpec`."""
+        """Return whether the format supports an option of `FormatOptions`."""
         if option == "compensated_actors":
             return cls.by_sweep and cls.frame != "none"
         return option in cls.options
 
     @classmethod
-    def check_options(cls, spec: ExportSpec) -> None:
+    def check_options(cls, spec: FormatOptions) -> None:
         """Raise LidarError if options that the format supports cannot be combined."""
         del spec
 
     @classmethod
-    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+    def fields_for(cls, spec: FormatOptions) -> tuple[PointField, ...]:
         """Return the fields of a point with the options in `spec`."""
         return cls.fields
 
     @classmethod
-    def required_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
+    def required_columns(cls, spec: FormatOptions) -> tuple[str, ...]:
         """Return the columns that a cloud must have."""
         fields = [field for field in cls.fields_for(spec) if field.is_required]
         required = [*cls.required, *(name for field in fields for name in field.columns)]
@@ -135,7 +118,7 @@ class CloudFormat(ABC):
         return tuple(dict.fromkeys([*scan, *required, *time]))
 
     @classmethod
-    def stored_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> set[str] | None:
+    def stored_columns(cls, spec: FormatOptions, sweeps: Sweeps) -> set[str] | None:
         """Return the columns that the format can store, or None if it can store all columns."""
         if cls.other_columns:
             return None

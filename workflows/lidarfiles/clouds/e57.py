@@ -28,13 +28,13 @@ from lidarsim.words import printable
 from ..identity.fingerprint import fingerprint
 from ..processes.per_process import PerProcess
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .gps_time import gps_start_s
 from .point_field import OMITTED, PointField
 from .recording import Recording
 from .recording_ref import RecordingRef
 from .return_numbers import return_numbers
 from .well_known_text import wkt
-from .writing import ExportSpec
 
 _THIN = "downsample it first"
 _COORDINATES = {
@@ -94,7 +94,7 @@ class E57(CloudFormat):
     other_columns = False
     for_scenes = True
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the file."""
         from pye57 import libe57
 

@@ -1,8 +1,8 @@
-"""Table of the cloud formats, with their files, required packages and classes.
+"""Find cloud formats by their names and files, among the built-in formats and plug-ins.
 
-The module is fast to import because the command line reads it for help and completion. Only
-`FormatRow.load` imports the class of a format. Other distributions add formats through entry points
-in the group `GROUP`, which are named after the format.
+The module is fast to import because the command line uses it for help and completion. Other
+distributions add formats through entry points in the group `GROUP`, which are named after the
+format.
 """
 
 from __future__ import annotations
@@ -11,84 +11,18 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lidarsim.environment.plugins import Plugin, PluginTable, plugins_of
 from lidarsim.errors import LidarError
 
+from .built_in_formats import DATA_SETS, FORMATS, READ_ONLY
 from .format_row import FormatRow
 
 if TYPE_CHECKING:  # NumPy
     from .cloud_format import CloudFormat
 
 GROUP = "lidarpool.clouds"
-_LAS: dict[str, Any] = {"packages": ("laspy", "lazrs"), "extra": "las"}
-_OSI: dict[str, Any] = {"packages": ("betterosi",), "extra": "osi"}
-_ROS: dict[str, Any] = {"packages": ("rosbags",), "extra": "ros"}
-FORMATS = {
-    "ply": FormatRow("cloud.ply", "lidarfiles.clouds.ply:PLY", (".ply",), ("cloud.ply",)),
-    "las": FormatRow("cloud.las", "lidarfiles.clouds.las:LAS", (".las",), **_LAS),
-    "laz": FormatRow("cloud.laz", "lidarfiles.clouds.las:LAZ", (".laz",), **_LAS),
-    "parquet": FormatRow(
-        "cloud.parquet",
-        "lidarfiles.clouds.parquet:Parquet",
-        (".parquet",),
-        ("**/*.parquet",),
-        packages=("pyarrow",),
-        extra="parquet",
-    ),
-    "pcd": FormatRow("pcd", "lidarfiles.clouds.pcd:PCD", (".pcd",), ("*.[pP][cC][dD]",)),
-    "e57": FormatRow(
-        "cloud.e57",
-        "lidarfiles.clouds.e57:E57",
-        (".e57",),
-        packages=("pye57",),
-        extra="e57",
-    ),
-    "kitti": FormatRow(
-        "kitti",
-        "lidarfiles.clouds.kitti:KITTI",
-        (".bin",),
-        ("sequences/*/velodyne", "velodyne/*.bin", "velodyne_points/data/*.bin", "*.bin"),
-    ),
-    "nuscenes": FormatRow(
-        "nuscenes",
-        "lidarfiles.clouds.nuscenes:NuScenes",
-        folders=("v1.0-*/sample_data.json", "sample_data.json"),
-    ),
-    "webdataset": FormatRow(
-        "webdataset", "lidarfiles.clouds.webdataset:WebDataset", (".tar",), ("**/*.tar",)
-    ),
-    "images": FormatRow("images", "lidarfiles.clouds.images:ImageFolder", folders=("*/*.npz",)),
-    "pcap": FormatRow(
-        "packets", "lidarfiles.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
-    ),
-    "rrd": FormatRow("cloud.rrd", "lidarfiles.clouds.rrd:RRD", packages=("rerun",), extra="rerun"),
-    # Readers derive the message type from the suffix "_sd" in the file name.
-    "osi": FormatRow("cloud_sd.osi", "lidarfiles.clouds.osi:OSI", **_OSI),
-    "osi_mcap": FormatRow("cloud_osi.mcap", "lidarfiles.clouds.osi:OSIInMCAP", **_OSI),
-    "mcap": FormatRow("cloud.mcap", "lidarfiles.clouds.ros.bags:MCAP", (".mcap",), **_ROS),
-    "rosbag2": FormatRow(
-        "rosbag2", "lidarfiles.clouds.ros.bags:Rosbag2", folders=("metadata.yaml",), **_ROS
-    ),
-}
-_READ_ONLY = FormatRow(
-    "",
-    "lidarfiles.clouds.text_and_arrays:TextFormats",
-    suffixes=(".xyz", ".txt", ".asc", ".csv", ".pts", ".ptx", ".npy"),
-)
-DATA_SETS = {  # {format of a data set: format of its jobs}
-    "folder": "ply",
-    "parquet": "parquet",
-    "kitti": "kitti",
-    "nuscenes": "nuscenes",
-    "webdataset": "webdataset",
-    "images": "images",
-    "mcap": "mcap",
-}
-EXPORTS = tuple(name for name in FORMATS if name != "ply")  # results always contain a .ply file
-# Point layouts in mcap and rosbag2 (`ros/layouts.py`).
-LAYOUTS = ("velodyne", "autoware", "ouster", "images", "livox", "hesai", "robosense")
 
 
 def data_set_title(data_set: str) -> str:
@@ -149,7 +83,7 @@ def load_format(name: str) -> type[CloudFormat]:
 
 def _all_rows() -> Iterator[FormatRow]:
     """Yield the rows of the table, followed by the rows of usable plug-ins."""
-    yield from (*FORMATS.values(), _READ_ONLY)
+    yield from (*FORMATS.values(), READ_ONLY)
     for name in plugins_of(GROUP):
         with suppress(LidarError):
             yield _TABLE[name]

@@ -25,8 +25,7 @@ from lidarsim.sweeps.ray_image import RayImage, require_fired_rays
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
 
 from .boxes import Boxes
-from .cloud_format import Entry, PointColumns
-from .job_reader import JobReader
+from .job_reader import Entry, JobReader, PointColumns
 from .multi_file_format import MultiFileFormat
 from .point_field import PointField
 from .recording import FileRecording, Recording

@@ -9,6 +9,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,12 +17,24 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.io.storage import Storage
-from lidarsim.numerics.arrays import AnyArray
+from lidarsim.numerics.arrays import AnyArray, Floats32
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .cloud_format import Entry, PointColumns
+# Points in the sensor frame in meters, with shape (n, 3), and the columns that the format stores,
+# as {column: array with shape (n,)}.
+PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job in a data set, whose number and name identify its files."""
+
+    number: int
+    name: str
+    split: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)  # varied values by name
 
 
 class JobReader:

@@ -36,8 +36,7 @@ from lidarsim.words import join_names
 
 from . import kitti_boxes
 from .boxes import Boxes
-from .cloud_format import Entry, PointColumns
-from .job_reader import JobReader
+from .job_reader import Entry, JobReader, PointColumns
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes, as_npy
 from .point_field import OMITTED, PointField
 from .recorded_boxes import RecordedBoxes

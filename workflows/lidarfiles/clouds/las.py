@@ -32,6 +32,7 @@ from lidarsim.words import join_names
 
 from .cloud_format import CloudFormat
 from .flight_lines import FlightLines
+from .format_options import FormatOptions
 from .gps_time import gps_start_s
 from .intensity_full_scale import compute_full_scale
 from .las_header import las_system, noise_classes, open_las
@@ -40,7 +41,6 @@ from .recording import PointCloud
 from .recording_ref import RecordingRef
 from .return_numbers import return_numbers
 from .well_known_text import wkt
-from .writing import ExportSpec
 
 if TYPE_CHECKING:
     import laspy
@@ -146,7 +146,7 @@ class LAS(CloudFormat):
             "extra bytes `class` contain the true numbers"
         ]
 
-    def write(self, path: Path, spec: ExportSpec) -> float | None:
+    def write(self, path: Path, spec: FormatOptions) -> float | None:
         """Write the file and return the intensity that is stored as 65,535."""
         import laspy
         import lazrs

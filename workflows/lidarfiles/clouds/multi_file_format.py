@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,8 @@ from lidarsim.numerics.arrays import AnyArray
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .format_table import format_row, load_format
-
-if TYPE_CHECKING:
-    from .writing import ExportSpec
 
 # NumPy, pyarrow and disk I/O hold the GIL for at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
@@ -51,7 +49,7 @@ class MultiFileFormat(CloudFormat):
     """
 
     folders: Sequence[str] = ()  # folders that contain the files of the pieces
-    compensated = False  # option of `ExportSpec`
+    compensated = False  # option of `FormatOptions`
 
     def __len__(self) -> int:
         return len(self.sweeps)
@@ -79,7 +77,7 @@ class MultiFileFormat(CloudFormat):
         return {}
 
     def write(
-        self, path: Path, spec: ExportSpec, workers: RangeWorkers | None = None
+        self, path: Path, spec: FormatOptions, workers: RangeWorkers | None = None
     ) -> float | None:
         """Write all files to a new folder.
 
@@ -89,7 +87,7 @@ class MultiFileFormat(CloudFormat):
         return None
 
     def write_to(
-        self, storage: Storage, spec: ExportSpec, workers: RangeWorkers | None = None
+        self, storage: Storage, spec: FormatOptions, workers: RangeWorkers | None = None
     ) -> None:
         """Write all files.
 

@@ -33,8 +33,7 @@ from lidarsim.words import plural
 
 from ..identity.fingerprint import fingerprint
 from .boxes import Boxes, json_number
-from .cloud_format import Entry, PointColumns
-from .job_reader import JobReader
+from .job_reader import Entry, JobReader, PointColumns
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes
 from .point_field import OMITTED, PointField
 from .recorded_boxes import RecordedBoxes

@@ -25,9 +25,9 @@ from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .gps_time import GPS_NS
 from .point_field import NONE, OMITTED, PointField
-from .writing import ExportSpec
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
 # Field numbers in osi_sensordata.proto and osi_featuredata.proto of OSI 3.
@@ -78,7 +78,7 @@ class OSI(CloudFormat):
     actor_boxes = True
     suffix: ClassVar[str] = ".osi"  # extension by which betterosi selects the type of trace
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the trace."""
         osi: Any = import_module("betterosi")  # optional dependency
         messages = _OSIMessages(osi, self.sweeps)

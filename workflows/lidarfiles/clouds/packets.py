@@ -16,11 +16,11 @@ from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import make_identifiers
 
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .point_field import OMITTED, PointField
 from .recording import Recording, sweep_from_columns
 from .recording_ref import RecordingRef
 from .sequential_recording import SequentialRecording
-from .writing import ExportSpec
 
 
 class PacketCapture(CloudFormat):
@@ -58,7 +58,7 @@ class PacketCapture(CloudFormat):
             names |= dict.fromkeys(encoder.columns)
         return (*names,)
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the folder."""
         sources = [
             PacketSource.for_sensor(self.sweeps, number)

@@ -18,8 +18,7 @@ from lidarsim.io.input_files import input_size
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .cloud_format import Entry, PointColumns
-from .job_reader import JobReader
+from .job_reader import Entry, JobReader, PointColumns
 from .multi_file_format import MultiFileFormat
 from .parquet_groups import check_groups, group_allowance, number_columns, read_group
 from .recording import PointCloud, sweep_from_columns

@@ -20,11 +20,11 @@ from lidarsim.scene.colors import pack_as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
+from .format_options import FormatOptions
 from .multi_file_format import MultiFileFormat
 from .point_field import OMITTED, PointField
 from .recording import FileRecording, Recording
 from .recording_ref import RecordingRef
-from .writing import ExportSpec
 
 _COMMENT_BYTES = 1000  # maximum number of bytes that are read from the first line
 
@@ -56,7 +56,7 @@ class PCD(MultiFileFormat):
     for_scenes = True
 
     @classmethod
-    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+    def fields_for(cls, spec: FormatOptions) -> tuple[PointField, ...]:
         """Return the fields of a point, which has no time if it is motion-compensated."""
         return tuple(f for f in cls.fields if f.name != "time" or not spec.compensated)
 

@@ -27,12 +27,12 @@ from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 from lidarsim.words import printable
 
 from ..open3d_access.open3d_module import load_open3d
-from .cloud_format import CloudFormat, PointColumns
-from .job_reader import JobReader
+from .cloud_format import CloudFormat
+from .format_options import FormatOptions
+from .job_reader import JobReader, PointColumns
 from .recording import PointCloud, Recording, sweep_from_columns
 from .recording_ref import RecordingRef
 from .results import open_cloud
-from .writing import ExportSpec
 
 # Positions are stored as float32 if the error is below this fraction of the precision.
 _ROUNDING_SHARE = 0.05
@@ -57,7 +57,7 @@ class PLY(CloudFormat):
     job_path = "jobs/{name}/cloud.ply"
     for_scenes = True
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the file."""
         cloud = self.cloud
         position_type = position_dtype(cloud.bounds, self.sweeps.precision_m)

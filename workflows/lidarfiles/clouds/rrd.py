@@ -19,10 +19,10 @@ from lidarsim.packets.encoders import START_NS
 
 from ..color_table import TURBO
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .frame_names import VEHICLE, WORLD
 from .point_field import OMITTED, PointField
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
-from .writing import ExportSpec
 
 APPLICATION = "lidarpool"
 SURVEY_TIME = "survey"  # timeline that starts with the survey
@@ -69,7 +69,7 @@ class RRD(CloudFormat):
     required = ("object",)
     actor_boxes = True
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the recording."""
         surroundings = Surroundings.from_sweeps(self.sweeps, self.content())
         with _recording_to(path) as recording:

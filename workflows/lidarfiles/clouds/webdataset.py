@@ -25,8 +25,7 @@ from lidarsim.numerics.arrays import AnyArray, Ints
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers, states_compensation
 
 from .boxes import Boxes, SweepBoxes, json_number
-from .cloud_format import Entry, PointColumns
-from .job_reader import JobReader
+from .job_reader import Entry, JobReader, PointColumns
 from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange, as_npy
 from .point_field import PointField
 from .recording import Recording, RecordingInfo

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from lidarsim.environment.extras import install_command
 from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_fields
-from lidarsim.schema.declared import FileSection, about
 from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
@@ -29,15 +28,16 @@ from lidarsim.words import join_alternatives, join_names
 from ..parts.parts import StoredCloud
 from ..picture_file import PictureContent
 from ..work.publishing import publishing
+from .built_in_formats import FORMATS
 from .cloud_format import CloudFormat
+from .format_options import FormatOptions
 from .format_row import FormatRow
-from .format_table import EXPORTS, FORMATS, LAYOUTS, format_row, load_format
+from .format_table import format_row, load_format
 from .multi_file_format import MultiFileFormat, RangeWorkers
 from .point_field import OMITTED, PointField
 from .return_numbers import known_columns
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
-_FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
 # Columns whose omission is always noted, and columns with the strength of a return.
 _ALWAYS = ("channel", "object")
 _STRENGTHS = {"intensity", "reflectivity", "signal"}
@@ -46,70 +46,14 @@ _OPTIONS = (
     "layout", "compensated", "compensated_actors", "pose_rate_hz", "intensity_full_scale",
     "organized",
 )  # fmt: skip
-_NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
 
 @dataclass(frozen=True)
-class ExportSpec(FileSection):
+class ExportSpec(FormatOptions):
     """An export format with its options.
 
     In YAML, the name of the format is sufficient.
     """
-
-    format: Annotated[
-        str,
-        about(
-            f"format, with the name of its file or folder in parentheses: {_FILES}, or a format "
-            "of a plug-in",
-            json_schema_extra=_NAMES,
-        ),
-    ]
-    layout: Annotated[
-        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        about("point layout in mcap and rosbag2"),
-    ] = "velodyne"
-    compensated: Annotated[
-        bool,
-        about(
-            "whether points in mcap, rosbag2 and pcd are motion-compensated to the start of the "
-            "sweep and have no times; otherwise, each point is in the sensor frame at the time of "
-            "its firing, as published by drivers"
-        ),
-    ] = False
-    compensated_actors: Annotated[
-        bool,
-        about(
-            "whether points of actors are moved to the pose of the actor at the start of the "
-            "sweep, so that they are inside its box; otherwise, they are at the pose at the time "
-            "of their firing (formats of single sweeps only)"
-        ),
-    ] = False
-    pose_rate_hz: Annotated[
-        float | None,
-        about(
-            "poses per second on /tf in mcap and rosbag2 (default: one pose at the start of "
-            "each sweep)",
-            gt=0,
-            le=10_000,
-        ),
-    ] = None
-    organized: Annotated[
-        bool,
-        about(
-            "whether clouds in mcap and rosbag2 contain one point per ray, with NaN for rays "
-            "without a return, in the row order of the driver (layouts velodyne, ouster, images "
-            "and robosense only)"
-        ),
-    ] = False
-    intensity_full_scale: Annotated[
-        float | None,
-        about(
-            "intensity that las and laz store as 65,535 (default: chosen from the cloud, so "
-            "that at most 1 % of the points reach it)",
-            gt=0,
-            le=1e9,
-        ),
-    ] = None
 
     __repr__ = one_line
 

@@ -31,9 +31,11 @@ from lidarsim.schema.value_texts import one_line
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..clouds.boxes import Boxes, summarize_boxes
-from ..clouds.cloud_format import CloudFormat, Entry
+from ..clouds.built_in_formats import DATA_SETS, LAYOUTS
+from ..clouds.cloud_format import CloudFormat
 from ..clouds.folder import local_folder
-from ..clouds.format_table import DATA_SETS, LAYOUTS, load_format
+from ..clouds.format_table import load_format
+from ..clouds.job_reader import Entry
 from ..clouds.multi_file_format import MultiFileFormat
 from ..clouds.writing import ExportSpec
 from ..identity.sealed import SealedWriter

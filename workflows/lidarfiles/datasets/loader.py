@@ -30,10 +30,9 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarsim.words import did_you_mean, join_names, plural
 
 from ..clouds.boxes import Boxes, BoxVisibility
-from ..clouds.cloud_format import Entry
+from ..clouds.built_in_formats import DATA_SETS
 from ..clouds.folder import check_exists
-from ..clouds.format_table import DATA_SETS
-from ..clouds.job_reader import JobReader
+from ..clouds.job_reader import Entry, JobReader
 from ..identity.sealed import unseal_json
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table

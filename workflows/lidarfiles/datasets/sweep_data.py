@@ -9,7 +9,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.boxes import Boxes, SweepBoxes
-from ..clouds.cloud_format import PointColumns
+from ..clouds.job_reader import PointColumns
 from ..clouds.writing import ExportSpec
 from .job_table import JobRow
 

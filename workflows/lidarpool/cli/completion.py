@@ -12,7 +12,8 @@ from contextlib import suppress
 import click
 from click.shell_completion import CompletionItem
 
-from lidarfiles.clouds.format_table import EXPORTS, GROUP
+from lidarfiles.clouds.built_in_formats import EXPORTS
+from lidarfiles.clouds.format_table import GROUP
 from lidarlive.playback.bridge_table import BRIDGES
 from lidarlive.viewers.viewer_table import PAGE, VIEWERS
 from lidarsim.errors import LidarError

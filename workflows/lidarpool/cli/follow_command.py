@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lidarfiles.clouds.format_table import LAYOUTS
+from lidarfiles.clouds.built_in_formats import LAYOUTS
 
 from . import shared_options as options
 from .first_step import print_first_step

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarfiles.clouds.format_table import LAYOUTS
+from lidarfiles.clouds.built_in_formats import LAYOUTS
 
 from . import completion
 from . import shared_options as options

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarfiles.clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
+from lidarfiles.clouds.built_in_formats import EXPORTS, LAYOUTS
+from lidarfiles.clouds.format_table import format_row, load_format
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.schema.vocabulary import PICTURES
 

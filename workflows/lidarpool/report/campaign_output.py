@@ -16,8 +16,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from lidarfiles.clouds.built_in_formats import DATA_SETS
 from lidarfiles.clouds.folder import LAST_FILE, check_exists, result_folder
-from lidarfiles.clouds.format_table import DATA_SETS, load_format
+from lidarfiles.clouds.format_table import load_format
 from lidarfiles.datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from lidarfiles.datasets.job_seconds import known_seconds
 from lidarfiles.datasets.job_table import TABLE_FILE, JobRow, read_table, write_table

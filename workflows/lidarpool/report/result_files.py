@@ -11,8 +11,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from lidarfiles.clouds.built_in_formats import FORMATS
 from lidarfiles.clouds.folder import LAST_FILE
-from lidarfiles.clouds.format_table import FORMATS, format_row, plugin_formats
+from lidarfiles.clouds.format_table import format_row, plugin_formats
 from lidarfiles.clouds.writing import ExportSpec, check_foreign_files
 from lidarfiles.identity.field_words import describe_changes
 from lidarfiles.picture_file import PICTURE_FILE

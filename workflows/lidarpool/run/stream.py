@@ -21,7 +21,7 @@ import numpy as np
 from distributed import Client
 
 from lidarfiles.clouds.boxes import Boxes
-from lidarfiles.clouds.cloud_format import PointColumns
+from lidarfiles.clouds.job_reader import PointColumns
 from lidarfiles.clouds.kitti import kitti_intensity
 from lidarfiles.datasets.job_table import JobRow
 from lidarfiles.datasets.sweep_data import is_compensated, sweep_of_job

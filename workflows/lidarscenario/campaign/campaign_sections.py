@@ -29,7 +29,7 @@ from pydantic import (
     model_validator,
 )
 
-from lidarfiles.clouds.format_table import DATA_SETS, LAYOUTS
+from lidarfiles.clouds.built_in_formats import DATA_SETS, LAYOUTS
 from lidarfiles.clouds.writing import ExportSpec
 from lidarfiles.datasets.job_table import Value
 from lidarsim.errors import LidarError, MissingFileError, Mistakes, message_of

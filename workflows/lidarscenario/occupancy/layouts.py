@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lidarfiles.clouds.cloud_format import Entry
+from lidarfiles.clouds.job_reader import Entry
 from lidarfiles.clouds.kitti import MAX_INSTANCES, first_sequence, sequence_names
 from lidarfiles.clouds.nuscenes import sample_tokens
 from lidarsim.errors import LidarError

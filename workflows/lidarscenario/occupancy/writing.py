@@ -13,8 +13,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lidarfiles.clouds.cloud_format import Entry
 from lidarfiles.clouds.folder import check_new_result, check_not_existing, result_folder
+from lidarfiles.clouds.job_reader import Entry
 from lidarfiles.identity.fingerprint import fingerprint
 from lidarfiles.work.mapping import describe_sweeps, parallel_map
 from lidarfiles.work.work import FileStep, Inputs, Work, fingerprint_files, link_files

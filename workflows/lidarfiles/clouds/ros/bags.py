@@ -41,15 +41,15 @@ from lidarsim.words import join_names
 
 from ...processes.per_process import PerProcess
 from .. import laser_scan
-from ..cloud_format import CloudFormat, PointColumns
+from ..cloud_format import CloudFormat
+from ..format_options import FormatOptions
 from ..frame_names import WORLD, survey_start_ns
-from ..job_reader import JobReader
+from ..job_reader import JobReader, PointColumns
 from ..point_field import OMITTED, PointField
 from ..recorded_boxes import RecordedBoxes
 from ..recording import Recording, sweep_from_columns
 from ..recording_ref import RecordingRef
 from ..sequential_recording import SequentialRecording
-from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
 _LAYOUT_KEY = "lidarpool_layout"  # custom data of simulated bags
@@ -126,7 +126,7 @@ class Rosbag2(CloudFormat):
     actor_boxes = True
     file_pattern = r"metadata\.yaml|rosbag2\w*\.mcap"
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the folder."""
         from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -154,7 +154,7 @@ class Rosbag2(CloudFormat):
                 bag.write(topics[message.topic], message.time_ns, message.cdr)
 
     @classmethod
-    def check_options(cls, spec: ExportSpec) -> None:
+    def check_options(cls, spec: FormatOptions) -> None:
         """Raise LidarError if the layout does not support organized clouds."""
         if spec.organized and not LAYOUTS[spec.layout].lines:
             organized = [name for name, layout in LAYOUTS.items() if layout.lines]
@@ -165,7 +165,7 @@ class Rosbag2(CloudFormat):
             )
 
     @classmethod
-    def fields_for(cls, spec: ExportSpec) -> tuple[PointField, ...]:
+    def fields_for(cls, spec: FormatOptions) -> tuple[PointField, ...]:
         """Return the fields of the layout, followed by those that depend on the cloud."""
         layout = LAYOUTS[spec.layout]
         fields = layout.point_fields
@@ -175,7 +175,7 @@ class Rosbag2(CloudFormat):
         return (*fields, *organized, *cls.fields)
 
     @classmethod
-    def stored_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> set[str] | None:
+    def stored_columns(cls, spec: FormatOptions, sweeps: Sweeps) -> set[str] | None:
         """Return the columns that can be stored, including the columns of LaserScan messages."""
         columns = super().stored_columns(spec, sweeps) or set()
         return columns | {*(laser_scan.COLUMNS if laser_scan.has_laser_scans(sweeps) else ())}
@@ -209,7 +209,7 @@ class MCAP(Rosbag2):
     file_pattern = ""
     job_path = "bags/{name}.mcap"
 
-    def write(self, path: Path, spec: ExportSpec) -> None:
+    def write(self, path: Path, spec: FormatOptions) -> None:
         """Write the file."""
         folder = path.with_name(f"{path.name}.bag")
         try:
