@@ -125,8 +125,8 @@ class StageStats:
         Number of tasks that raised an error, or that Dask stopped retrying after too many workers
         had died. Their dependents, which never ran, are not counted.
     seconds
-        Total running time of finished tasks in seconds, including failed tasks but excluding lost
-        runs.
+        Total running time in seconds of tasks that finished or raised an error. Lost runs and tasks
+        that exceeded their time limit are not included.
     queued_seconds
         Total time in seconds that these tasks waited for a worker or a slot after their inputs were
         available.

@@ -119,6 +119,7 @@ def test_every_format_that_can_be_opened_is_tested():
     assert opened == FORMATS.keys() & KINDS.keys()
 
 
+@pytest.mark.extended(every=3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_processes_read_the_same_points(write, pool, kind):
     recording = open_recording(write(kind), KINDS[kind])

@@ -96,6 +96,7 @@ def write_data_set(folder, name, *clouds):
     return folder / name
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])
 @pytest.mark.parametrize("name", DATA_SETS)
 def test_sweeps_of_data_sets_state_their_compensation(name, coordinates, tmp_path):
@@ -121,6 +122,7 @@ def test_data_sets_of_different_jobs_state_no_common_compensation(tmp_path):
     assert [recording[number].compensated for number in (0, SWEEPS)] == [True, False]
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("name", ["mcap", "pcd"])
 @pytest.mark.parametrize("is_stated", [True, False])
 @pytest.mark.parametrize("compensated", [True, False])
@@ -232,6 +234,7 @@ def write_as_fired(folder, key):
     return folder / file
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("key", AS_FIRED)
 def test_points_as_fired_are_compared_in_world_coordinates(key, tmp_path):
     """At the pose of its sweep, a point would be up to 1.2 m from the surface."""
