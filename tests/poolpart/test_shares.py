@@ -1,6 +1,7 @@
 """Clients of a partition take turns, however and how many tasks each of them submits."""
 
 import itertools
+import threading
 import time
 from collections import Counter
 from contextlib import ExitStack
@@ -235,16 +236,25 @@ def test_tasks_that_are_cancelled_while_they_wait_are_forgotten(pair, gate):
     assert not ran
 
 
+opened = threading.Event()
+
+
+def wait_until_opened():
+    """Wait without lending the slot, in contrast to tasks that wait for Dask's events."""
+    return opened.wait(LONG_S)
+
+
 def test_tasks_bound_to_a_worker_do_not_delay_others(start):
     client = start({name: {"resources": {"P": 1}} for name in "ab"})
     part = Partition("P", client)
-    blocker = part.submit(wait_for, "gate", workers="a")
+    opened.clear()
+    blocker = part.submit(wait_until_opened, workers="a")
     bound = [part.submit(abs, n, workers=addresses(client)["a"]) for n in range(9)]
     with Client(client.cluster) as other:
         others = [Partition("P", other).submit(abs, n) for n in range(9)]
         assert other.gather(others) == [*range(9)]
         assert not any(future.done() for future in bound)
-        Event("gate", client).set()
+        opened.set()
         assert client.gather([*bound, blocker]) == [*range(9), True]
 
 
