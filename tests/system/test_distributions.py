@@ -4,7 +4,6 @@ import ast
 import importlib.metadata
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -373,10 +372,6 @@ class Environment:
         more = here if command == "install" else []
         python("-m", "pip", "--python", self.bin / "python", command, "--quiet", *more, *options)
 
-    def link(self, *names: str) -> None:
-        """Make packages of this environment available, with what they require."""
-        self._link([Requirement(name) for name in names])
-
     def _link(self, wanted: list[Requirement]) -> None:
         done: set[tuple[str, str]] = set()
         while wanted:
@@ -448,34 +443,6 @@ def test_each_alone_needs_no_more_than_it_declares(built, tmp_path, name):
             assert not alone.run("lidarpool", *command, cwd=tmp_path).startswith("exit")
     else:
         assert alone.run_readme(name, tmp_path) == distribution.prints
-
-
-# Folders of tests of the distributions, and what these tests import besides.
-TESTED = {
-    "raybeam": ("raybeam",),
-    "poolpart": ("poolpart",),
-    "lidarsim": ("lidarsim",),
-    "lidarfiles": ("lidarfiles",),
-    "lidarreal": ("lidarscenes", "lidarview", "lidarscenario", "lidarreal"),
-}
-TOOLS = ("pytest", "pytest-timeout", "hypothesis", "trimesh", "pillow", "mpmath", "jsonschema")
-# Extras of other hardware, and those that installations for tests do without.
-LEFT_OUT = {"cuda12", "cuda13", "rerun"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", TESTED)
-def test_the_tests_of_each_pass_alone(built, tmp_path, name):
-    extras = {*declared(name)["project"].get("optional-dependencies", {})} - LEFT_OUT
-    alone = Environment(tmp_path / "venv", built, f"{name}[{','.join(extras)}]")
-    alone.link(*TOOLS)
-    for copied in ("tests", "examples", "docs", "benchmarks"):
-        shutil.copytree(ROOT / copied, tmp_path / copied, dirs_exist_ok=True)
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    folders = [f"tests/{folder}" for folder in TESTED[name]]
-    command = ("python", "-m", "pytest", "-q", "-x", "-o", "pythonpath=.", *folders)
-    done = alone.run(*command, cwd=tmp_path)
-    assert re.search(r"\d+ passed", done.splitlines()[-1]) and "failed" not in done, done[-3000:]
 
 
 @pytest.mark.slow
