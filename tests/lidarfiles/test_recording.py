@@ -57,7 +57,7 @@ PLY += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n1 2 
 
 @pytest.fixture(scope="module")
 def pool():
-    """Return a process that shares nothing with this one."""
+    """Return a process that was not forked from this one."""
     with closing(ProcessPool(1)) as processes:
         yield processes
 

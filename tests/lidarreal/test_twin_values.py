@@ -453,7 +453,7 @@ def test_surfels_of_a_plane_close_the_gap_between_rings(range_m, incidence_deg, 
 
 @pytest.mark.parametrize(("range_m", "half_m"), [(5.0, 0.3), (40.0, 0.4), (90.0, 0.46)])
 def test_surfels_of_sparse_points_are_limited_by_voxels_or_the_gap_between_rings(range_m, half_m):
-    """The points are 0.5 m apart, and voxels 0.1 m large."""
+    """Points are 0.5 m apart, and voxels have an edge length of 0.1 m."""
     points = np.floor(lattice(20, 20, 0.5) / 0.1) * 0.1 + 0.05
     outward = np.tile([range_m, 0, 0], (400, 1))
     surfels = Surfels.from_points("plane", points, outward, 0.1, 0.01)

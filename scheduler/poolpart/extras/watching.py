@@ -7,9 +7,9 @@ such tasks are moved to free slots with the protocol of work stealing, in which 
 task only if it has not started it.
 
 A task that runs longer than its `timeout_s` fails. Dask does not stop its function, so its worker
-is restarted if the function does not return (see `cancelling.free_worker`). The same happens if a
-canceled task still runs when its limit has passed since it was canceled, because its client may
-have been killed.
+is restarted if the function does not return (see `cancelling.free_worker`). A task whose client was
+killed is canceled, and its function may hang as well. Its limit is then measured from the
+cancellation.
 
 The scheduler learns from heartbeats which tasks a worker runs, and since when. Workers in a small
 cluster send two heartbeats per second. If a task may have exceeded its limit according to the last
@@ -210,10 +210,7 @@ class TaskWatch:
         )
 
     def _end_canceled_tasks(self, name: str, members: Iterable[Any]) -> None:
-        """Restart workers on which a canceled task runs longer than its limit.
-
-        Tasks are also canceled when their client leaves.
-        """
+        """Restart workers whose canceled tasks have run beyond their limits."""
         shares = self.scheduler.plugins.get(SHARES)
         if shares is None or not shares.canceled:
             return
@@ -230,6 +227,7 @@ class TaskWatch:
     async def _end_canceled(
         self, name: str, worker: Any, key: Any, annotations: Any, since: float
     ) -> None:
+        """Restart a worker if the function of a canceled task is still running there."""
         load = await request_load(self.scheduler, worker)
         task = self.scheduler.tasks.get(key)
         if task is not None and task.processing_on is worker:  # it was submitted again
@@ -240,12 +238,12 @@ class TaskWatch:
             seconds = load.running[key]
         else:
             return
-        error = _error(key, worker, seconds, annotations)
+        error = _timeout_error(key, worker, seconds, annotations)
         with self._failing(worker, key):
             await self._end_function(name, worker, key, annotations, error)
 
     async def _ask(self, name: str, worker: Any) -> None:
-        """Ask a worker whether tasks are late that may be according to its last heartbeat."""
+        """Ask a worker about tasks that may have exceeded their limits since its last heartbeat."""
         try:
             load = await request_load(self.scheduler, worker)
             if load is None:
@@ -281,7 +279,7 @@ class TaskWatch:
                 logger.warning("One of the tasks %s blocks its worker (%s).", keys, outcome)
 
     def _end_soon(self, name: str, worker: Any, task: Any, seconds: float) -> None:
-        error = _error(task.key, worker, seconds, task.annotations)
+        error = _timeout_error(task.key, worker, seconds, task.annotations)
         ending = worker, task.key
         self._ending.add(ending)
         request = self._start(self._end(name, worker, task, error))
@@ -367,7 +365,7 @@ class TaskWatch:
         return request
 
 
-def _error(key: Any, worker: Any, seconds: float, annotations: Any) -> TaskTimeoutError:
+def _timeout_error(key: Any, worker: Any, seconds: float, annotations: Any) -> TaskTimeoutError:
     return TaskTimeoutError(
         f"Task {key!r} ran for {seconds:.1f} s on worker {worker.name}. Its limit is "
         f"{annotations[TIMEOUT]:g} s (`timeout_s`)."

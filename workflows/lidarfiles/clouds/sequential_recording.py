@@ -1,4 +1,4 @@
-"""Recordings in files that can only be read from their start."""
+"""Recordings whose files can only be read sequentially."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class SavedSweeps:
         job, number = self._locate(index)
         return job.read(number)
 
-    def read_fired(self, index: int) -> Sweep:
+    def fired(self, index: int) -> Sweep:
         """Read a sweep whose points are as fired, with its `firing_poses`.
 
         Raises the same errors as reading an item. The sweeps must have firing poses (see

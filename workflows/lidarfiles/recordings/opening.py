@@ -320,4 +320,4 @@ class _DataSetRecording(Recording):
         return self._saved[number]
 
     def load_fired(self, number: int) -> Sweep:
-        return self._saved.read_fired(number)
+        return self._saved.fired(number)

@@ -136,7 +136,7 @@ class JobList:
         saved = replace(saved, coordinates="world")
         loaded = sweeps(self.location, jobs=[row.number])
         has_firings = loaded.have_firing_poses()
-        read_sweep = loaded.read_fired if has_firings else loaded.__getitem__
+        read_sweep = loaded.fired if has_firings else loaded.__getitem__
         note = "" if has_firings or loaded.are_compensated() else _AS_FIRED
         posed = map(read_sweep, range(len(loaded)))
         read = [finite_points(sweep.replace(points=sweep.in_world())) for sweep in posed]
